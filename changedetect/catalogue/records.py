@@ -1,0 +1,219 @@
+"""
+Manifests: what a stored model or a folder of products was made from.
+
+A manifest is the identity of what lies beside it: its own SHA-256 is what children refer to, so that a model learned
+again makes everything derived from it stale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeVar
+
+from changedetect.errors import ModelStateError
+from changedetect.storage import read_json, sha256_of_file, write_json
+
+__all__ = ["MANIFEST_FILE", "ProductRecord", "SourceRecord", "StateRecord", "checksums", "damaged_files"]
+
+MANIFEST_FILE = "manifest.json"
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceRecord:
+    """
+    A source as it was read.
+
+    Attributes
+    ----------
+    uri : str
+    sha256 : str
+    size : int, bytes
+    modified_ns : int
+        Modification time of the file, ns since 1970: tells quickly that nothing happened to it.
+    options : mapping
+        `Source.reading_options`.
+    n_read, n_used : int
+        Points in the file after its filters, and those inside the programme's bounds.
+    crs : str or None
+        CRS the points were taken to be in.
+    """
+
+    uri: str
+    sha256: str
+    size: int
+    modified_ns: int
+    options: Mapping[str, Any]
+    n_read: int
+    n_used: int
+    crs: str | None
+
+
+class _Manifest:
+    """Reading and writing shared by the manifests below."""
+
+    FORMAT: ClassVar[int]
+
+    @classmethod
+    def read(cls, directory: Path) -> tuple[Self, str] | None:
+        """
+        Read the manifest of a folder, and its SHA-256; None where there is none.
+
+        Raises
+        ------
+        ModelStateError
+            The manifest is damaged, or lacks what this version writes.
+        """
+        path = directory / MANIFEST_FILE
+        if not path.is_file():
+            return None
+        document = read_json(path)
+        version = document.get("format_version") if isinstance(document, dict) else None
+        if version != cls.FORMAT:
+            msg = (
+                f"'{path}' has format_version {version!r}, this version of changedetect reads {cls.FORMAT}. "
+                "`changedetect update` makes the folder anew."
+            )
+            raise ModelStateError(msg)
+        return cls.from_document(document, path), sha256_of_file(path)
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], path: Path) -> Self:
+        """Build from the JSON object of `path`."""
+        return _from_document(cls, document, path)
+
+    def write(self, directory: Path) -> None:
+        """Write the manifest into a folder."""
+        document = {"format_version": self.FORMAT, **asdict(self)}  # type: ignore[call-overload]
+        write_json(directory / MANIFEST_FILE, document)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateRecord(_Manifest):
+    """
+    Manifest of `state/EPOCH_ID/`.
+
+    Attributes
+    ----------
+    epoch_id : str
+    mode : str
+        "adaptive" or "reference".
+    survey_time : float
+        Days since 1970-01-01.
+    parent, parent_sha256 : str or None
+        Epoch whose model was adapted, and its manifest's checksum.
+    settings : mapping
+        `ProgrammeConfig.learning_settings`.
+    learning_sha256, config_sha256 : str
+        Fingerprints of the settings.
+    sources : tuple of SourceRecord
+    n_points : int
+        Observations learned in this epoch.
+    region : tuple (west, east, south, north), m
+        Ground the model has observed up to this epoch.
+    files : mapping of file name to SHA-256
+    software_version, created : str
+    """
+
+    FORMAT: ClassVar[int] = 1
+
+    epoch_id: str
+    mode: str
+    survey_time: float
+    parent: str | None
+    parent_sha256: str | None
+    settings: Mapping[str, Any]
+    learning_sha256: str
+    config_sha256: str
+    sources: tuple[SourceRecord, ...]
+    n_points: int
+    region: tuple[float, float, float, float]
+    files: Mapping[str, str]
+    software_version: str
+    created: str
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], path: Path) -> Self:
+        """Build from the JSON object of `path`."""
+        sources = tuple(_from_document(SourceRecord, item, path) for item in document.get("sources", []))
+        region = tuple(document.get("region", ()))
+        return _from_document(cls, {**document, "sources": sources, "region": region}, path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProductRecord(_Manifest):
+    """
+    Manifest of `products/EPOCH_ID/` (one epoch) or `products/EARLIER_LATER/` (two).
+
+    Attributes
+    ----------
+    epochs : tuple of str
+        One epoch, or the earlier and the later one.
+    states : mapping of epoch id to the SHA-256 of its state's manifest
+    settings : mapping
+        `ProgrammeConfig.product_settings`.
+    config_sha256 : str
+    region : tuple (west, east, south, north), m
+        Ground the rasters cover.
+    colour_limits : mapping of layer to (low, high)
+        Limits of the styles; the programme's other maps take them over.
+    warnings : tuple of str
+    files : mapping of file name to SHA-256
+    software_version, run_id, created : str
+    """
+
+    FORMAT: ClassVar[int] = 1
+
+    epochs: tuple[str, ...]
+    states: Mapping[str, str]
+    settings: Mapping[str, Any]
+    config_sha256: str
+    region: tuple[float, float, float, float]
+    colour_limits: Mapping[str, tuple[float, float]]
+    warnings: tuple[str, ...]
+    files: Mapping[str, str]
+    software_version: str
+    run_id: str
+    created: str
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], path: Path) -> Self:
+        """Build from the JSON object of `path`."""
+        tuples = {key: tuple(document.get(key, ())) for key in ("epochs", "region", "warnings")}
+        return _from_document(cls, {**document, **tuples}, path)
+
+
+def _from_document(owner: type[T], document: Mapping[str, Any], path: Path) -> T:
+    names = [field.name for field in fields(owner)]  # type: ignore[arg-type]
+    missing = [name for name in names if name not in document]
+    if missing:
+        msg = f"'{path}' is damaged: it lacks {', '.join(missing)}. `changedetect update` makes the folder anew."
+        raise ModelStateError(msg)
+    return owner(**{name: document[name] for name in names})
+
+
+def checksums(directory: Path) -> dict[str, str]:
+    """SHA-256 of every file below a folder, by its path relative to it, without the manifest."""
+    paths = sorted(path for path in directory.rglob("*") if path.is_file() and path.name != MANIFEST_FILE)
+    return {path.relative_to(directory).as_posix(): sha256_of_file(path) for path in paths}
+
+
+def damaged_files(directory: Path, files: Mapping[str, str], *, deep: bool) -> list[str]:
+    """
+    Say which of a manifest's files are missing or, with `deep`, differ from their checksums.
+
+    Returns
+    -------
+    complaints : list of str
+    """
+    complaints = []
+    for name, expected in files.items():
+        path = directory / name
+        if not path.is_file():
+            complaints.append(f"{name} is missing")
+        elif deep and sha256_of_file(path) != expected:
+            complaints.append(f"{name} differs from its checksum")
+    return complaints

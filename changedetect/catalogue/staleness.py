@@ -1,0 +1,216 @@
+"""
+What has to be made, and why.
+
+A model is stale when its sources, date, settings or parent are not those it was learned from; a product when its
+models or settings are not those it was made from. Reasons are sentences for people; no reason means up to date.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from changedetect.catalogue.epoch import Epoch, Source
+from changedetect.catalogue.programme import ChangeProduct, Programme
+from changedetect.catalogue.records import SourceRecord, damaged_files
+from changedetect.errors import MissingInputError, ModelStateError
+from changedetect.storage import sha256_of_file
+
+__all__ = [
+    "Item",
+    "epoch_product_reasons",
+    "own_state_reasons",
+    "pair_reasons",
+    "plan",
+    "state_reasons",
+    "wanted_pairs",
+]
+
+Kind = Literal["model", "epoch", "pair"]
+
+#: A checksum that no manifest has: the model it stands for is still to be learned.
+_TO_BE_LEARNED = "to be learned"
+
+
+@dataclass(frozen=True)
+class Item:
+    """
+    One thing a programme has or should have.
+
+    Attributes
+    ----------
+    kind : {"model", "epoch", "pair"}
+        The model of an epoch, the products of an epoch, or the products of two.
+    item_id : str
+        Epoch id, or ``EARLIER_LATER``.
+    reasons : tuple of str
+        Why it has to be made; empty where it is up to date.
+    """
+
+    kind: Kind
+    item_id: str
+    reasons: tuple[str, ...]
+
+    @property
+    def is_due(self) -> bool:
+        """Whether it has to be made."""
+        return bool(self.reasons)
+
+
+def plan(programme: Programme, rule: str | None = None) -> tuple[Item, ...]:
+    """
+    List models, epoch products and pair products in the order they are made, each with why it is due.
+
+    Parameters
+    ----------
+    programme : Programme
+    rule : {"consecutive", "first", "all"}, optional
+        Rule for the differences; the programme's own by default. Differences that exist already are kept current
+        whatever the rule says.
+    """
+    models = []
+    states: dict[str, str] = {}
+    parent: Epoch | None = None
+    for epoch in programme.epochs:
+        reasons = state_reasons(programme, epoch, parent, states)
+        models.append(Item("model", epoch.epoch_id, reasons))
+        record = None if reasons else programme.state_record(epoch.epoch_id)
+        states[epoch.epoch_id] = record[1] if record else _TO_BE_LEARNED
+        parent = epoch
+    surfaces = [Item("epoch", name, epoch_product_reasons(programme, name, states)) for name in states]
+    pairs = wanted_pairs(programme, rule, list(states))
+    changes = [Item("pair", pair.product_id, pair_reasons(programme, pair, states)) for pair in pairs]
+    return (*models, *surfaces, *changes)
+
+
+def wanted_pairs(programme: Programme, rule: str | None, epoch_ids: Sequence[str]) -> tuple[ChangeProduct, ...]:
+    """Differences that the rule asks for, and those that exist, among the given epochs."""
+    asked = programme.pairs(rule, epoch_ids)
+    kept = [pair for pair in programme.existing_pairs() if {pair.earlier, pair.later} <= {*epoch_ids}]
+    return (*asked, *(pair for pair in kept if pair not in asked))
+
+
+def state_reasons(
+    programme: Programme, epoch: Epoch, parent: Epoch | None, states: Mapping[str, str]
+) -> tuple[str, ...]:
+    """
+    Say why the model of an epoch has to be learned.
+
+    Parameters
+    ----------
+    programme : Programme
+    epoch : Epoch
+    parent : Epoch or None
+        The epoch whose model it adapts.
+    states : mapping of epoch id to the SHA-256 of its state's manifest
+        Of the earlier epochs.
+    """
+    own = own_state_reasons(programme, epoch)
+    found = programme.state_record(epoch.epoch_id) if own == () else None
+    if found is None:
+        return own
+    record, parent_id = found[0], parent.epoch_id if parent else None
+    if record.parent != parent_id:
+        return (f"it follows {_name(parent_id)} now, and followed {_name(record.parent)}",)
+    if parent_id is not None and record.parent_sha256 != states[parent_id]:
+        return (f"its parent {parent_id} {_learned(states[parent_id])}",)
+    return ()
+
+
+def own_state_reasons(programme: Programme, epoch: Epoch) -> tuple[str, ...]:
+    """Say why the model of an epoch has to be learned from its sources, whatever its parent."""
+    try:
+        found = programme.state_record(epoch.epoch_id)
+    except ModelStateError as error:
+        return (str(error),)
+    if found is None:
+        return ("not learned yet",)
+    record = found[0]
+    reasons = damaged_files(programme.state_directory(epoch.epoch_id), record.files, deep=False)
+    reasons += _changed_settings(record.settings, programme.config.learning_settings)
+    reasons += _changed_sources(programme, epoch.sources, record.sources)
+    if record.survey_time != epoch.survey_time:
+        reasons.append("its date has changed")
+    return tuple(reasons)
+
+
+def epoch_product_reasons(programme: Programme, epoch_id: str, states: Mapping[str, str]) -> tuple[str, ...]:
+    """Say why the rasters of one epoch have to be made; `states` as for `state_reasons`, the epoch included."""
+    settings = programme.config.product_settings(differencing=False)
+    return _product_reasons(programme, epoch_id, (epoch_id,), settings, states)
+
+
+def pair_reasons(programme: Programme, pair: ChangeProduct, states: Mapping[str, str]) -> tuple[str, ...]:
+    """Say why the difference of two epochs has to be made; `states` as for `state_reasons`, both included."""
+    settings = programme.config.product_settings(differencing=True)
+    return _product_reasons(programme, pair.product_id, (pair.earlier, pair.later), settings, states)
+
+
+def _product_reasons(
+    programme: Programme,
+    product_id: str,
+    epoch_ids: tuple[str, ...],
+    settings: Mapping[str, Any],
+    states: Mapping[str, str],
+) -> tuple[str, ...]:
+    try:
+        found = programme.product_record(product_id)
+    except ModelStateError as error:
+        return (str(error),)
+    if found is None:
+        return ("not made yet",)
+    record = found[0]
+    reasons = damaged_files(programme.product_directory(product_id), record.files, deep=False)
+    reasons += _changed_settings(record.settings, settings)
+    for epoch_id in epoch_ids:
+        if record.states.get(epoch_id) != states[epoch_id]:
+            reasons.append(f"the model of {epoch_id} {_learned(states[epoch_id])}")
+    return tuple(reasons)
+
+
+def _name(epoch_id: str | None) -> str:
+    return f"epoch {epoch_id}" if epoch_id else "no epoch"
+
+
+def _learned(state: str) -> str:
+    return "is to be learned" if state == _TO_BE_LEARNED else "was learned again"
+
+
+def _changed_settings(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    keys = [*new, *(key for key in old if key not in new)]
+    return [
+        f"setting {key} is {new.get(key, 'gone')!r}, was {old.get(key, 'not known')!r}"
+        for key in keys
+        if key not in old or key not in new or old[key] != new[key]
+    ]
+
+
+def _changed_sources(programme: Programme, sources: Sequence[Source], records: Sequence[SourceRecord]) -> list[str]:
+    """Compare by content where the epoch's file pins checksums, else by name and, if the file is there, content."""
+    if len(sources) != len(records):
+        return [f"it has {len(sources)} sources, was learned from {len(records)}"]
+    reasons = []
+    for source, record in zip(sources, records, strict=True):
+        if source.reading_options() != record.options:
+            reasons.append(f"source {source.name} is to be read differently")
+        if source.sha256 is not None:
+            if source.sha256 != record.sha256:
+                reasons.append(f"source {source.name} has another checksum")
+        elif source.uri != record.uri:
+            reasons.append(f"source {source.uri} takes the place of {record.uri}")
+        elif _file_differs(programme, source, record):
+            reasons.append(f"source {source.name} has changed on disk")
+    return reasons
+
+
+def _file_differs(programme: Programme, source: Source, record: SourceRecord) -> bool:
+    """Whether the file is there and is another one; models need no sources once they are learned."""
+    try:
+        path = source.path(programme.directory)
+        status = path.stat()
+    except (MissingInputError, OSError):
+        return False
+    if (status.st_size, status.st_mtime_ns) == (record.size, record.modified_ns):
+        return False
+    return status.st_size != record.size or sha256_of_file(path) != record.sha256

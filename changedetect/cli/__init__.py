@@ -1,0 +1,61 @@
+"""
+The command line: parse, call, print.
+
+`main` turns every outcome into an exit code: 0 done or nothing due, 2 usage, 10 significant change with
+``--exit-code``, 65 bad data, 66 missing input, 73 cannot create output, 74 input or output failed, 75 try again later,
+78 configuration, 130 interrupted, 1 a bug.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import typer
+
+from changedetect.cli.app import app
+from changedetect.cli.session import print_error, wants_json
+from changedetect.errors import ChangeDetectError
+
+__all__ = ["main"]
+
+logger = logging.getLogger(__name__)
+
+INTERRUPTED = 130
+INPUT_OUTPUT = 74
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """
+    Run the command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Those of the process by default.
+
+    Returns
+    -------
+    exit_code : int
+    """
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    is_json = wants_json(arguments)
+    try:
+        result: Any = app(args=list(arguments), standalone_mode=False)
+    except ChangeDetectError as error:
+        return print_error(error, error.exit_code, is_json=is_json)
+    except typer.TyperException as error:
+        if is_json:
+            return print_error(error, error.exit_code, is_json=True)
+        error.show()
+        return error.exit_code
+    except (typer.Abort, KeyboardInterrupt):
+        return print_error(KeyboardInterrupt("interrupted"), INTERRUPTED, is_json=is_json)
+    except OSError as error:
+        return print_error(error, INPUT_OUTPUT, is_json=is_json)
+    except Exception as error:
+        logger.critical("Unexpected failure, a bug in changedetect:", exc_info=True)
+        return print_error(error, 1, is_json=is_json)
+    return result if isinstance(result, int) else 0

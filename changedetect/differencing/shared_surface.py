@@ -1,0 +1,151 @@
+"""
+The difference of two epochs as a surface of its own beside one shared surface.
+
+The later epoch is modelled as f0 + d + noise, the earlier as f0 + noise. f0 follows the terrain with a fine kernel and
+is learned from both epochs together; what it leaves over is flat, so the kernel of d may be wide, the noise is found
+right, and smoothing bias is common to both epochs and cancels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from changedetect.models.cells import merge_cells
+from changedetect.models.pyramid import CENTROID_LIMIT, N_MINIMUM, Lattice, Level, build_level, fit_lattice
+
+if TYPE_CHECKING:
+    from changedetect.models.cells import Cells
+    from changedetect.typing import BoolArray, FloatArray, Region
+
+__all__ = ["LocalDifference", "estimate_difference"]
+
+#: Rounds of alternation between f0 and d; the third changes neither by more than 1 % of the noise.
+_ROUNDS = 3
+#: Kernel of f0 in the finest kernels the thinner epoch supports. With 1.0 f0 follows the noise and 7 % of unchanged
+#: cells were flagged at 9 observations a m2; with 1.4 it was 5.2 %.
+_SHARED_KERNEL = 2.0**0.5
+#: Kernel of d in kernels of f0.
+_CHANGE_KERNEL = 2.0
+#: Area over which a field averages, in squared kernels: n_eff = 20/9 pi h2 per unit density for the bisquare kernel.
+FIELD_AREA = 20.0 / 9.0 * np.pi
+_SPACING = 0.8
+
+
+@dataclass(frozen=True)
+class LocalDifference:
+    """
+    Difference on a lattice of output cells, row 0 in the south.
+
+    Attributes
+    ----------
+    difference, variance : array, shape (n_rows, n_columns), m, m2
+    freedom : array
+        Degrees of freedom of the variance.
+    counts : pair of array
+        Effective numbers of observations, earlier and later.
+    observed : pair of array, bool
+    kernel : float, m
+        Kernel size of the difference.
+    """
+
+    difference: FloatArray
+    variance: FloatArray
+    freedom: FloatArray
+    counts: tuple[FloatArray, FloatArray]
+    observed: tuple[BoolArray, BoolArray]
+    kernel: float
+
+
+def _joint_region(earlier: Cells, later: Cells) -> Region:
+    a, b = earlier.region, later.region
+    return min(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), max(a[3], b[3])
+
+
+def _surface(cells: Cells, region: Region, kernel: float) -> Level:
+    return build_level(cells, region, kernel, _SPACING * kernel, 0.0, None)
+
+
+def _without(cells: Cells, level: Level, sign: float = 1.0) -> Cells:
+    """Cells less sign * level; where the level is not defined nothing is taken off."""
+    return cells.with_plane_removed(sign * level.blend(*cells.centres))
+
+
+def _change(earlier: Cells, later: Cells, region: Region, kernel: float) -> Level:
+    """Difference of the local planes of what two epochs leave over the shared surface."""
+    a, b = _surface(earlier, region, kernel), _surface(later, region, kernel)
+    planes = b.planes.copy()
+    both = (a.planes[4] > 0.0) & (b.planes[4] > 0.0)
+    planes[:3] = np.where(both, b.planes[:3] - a.planes[:3], 0.0)
+    planes[4] = both
+    return Level(b.lattice, planes)
+
+
+def estimate_difference(earlier: Cells, later: Cells, kernel: float, lattice: Lattice) -> LocalDifference:
+    """
+    Later minus earlier surface, its variance, and where both saw the ground.
+
+    Parameters
+    ----------
+    earlier, later : Cells
+        Evidence of the two epochs, weights 1 / variance of an observation.
+    kernel : float, m
+        The finest that the thinner of the two epochs supports.
+    lattice : Lattice
+        Output cells; only its spacing and extent matter.
+
+    Returns
+    -------
+    result : LocalDifference
+
+    Notes
+    -----
+    The variance of each epoch's local linear fit is that of its weights times a factor s2 = residual sum / degrees of
+    freedom, both summed over a window of two kernels either side; observations are taken as independent.
+    """
+    region = _joint_region(earlier, later)
+    fine = _SHARED_KERNEL * kernel
+    wide = _CHANGE_KERNEL * fine
+    change: Level | None = None
+    left: tuple[Cells, Cells] = (earlier, later)
+    for _ in range(_ROUNDS):
+        moved = later if change is None else _without(later, change)
+        shared = _surface(merge_cells([earlier, moved]), region, fine)
+        left = (_without(earlier, shared), _without(later, shared))
+        change = _change(*left, region, wide)
+    output = Lattice(wide, lattice.spacing, lattice.first_row, lattice.first_column, *lattice.shape)
+    fits = [fit_lattice(cells, output) for cells in left]
+    reach = max(3, round(4.0 * wide / lattice.spacing) | 1)
+    variances, freedoms = zip(*(_value_variance(fit, reach) for fit in fits), strict=True)
+    variance = variances[0] + variances[1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        freedom = variance**2 / (variances[0] ** 2 / freedoms[0] + variances[1] ** 2 / freedoms[1])
+    return LocalDifference(
+        difference=fits[1][..., 0] - fits[0][..., 0],
+        variance=variance,
+        freedom=freedom,
+        counts=(fits[0][..., 10], fits[1][..., 10]),
+        observed=(_is_observed(fits[0]), _is_observed(fits[1])),
+        kernel=wide,
+    )
+
+
+def _is_observed(fits: FloatArray) -> BoolArray:
+    observed: BoolArray = (fits[..., 10] >= N_MINIMUM) & (fits[..., 13] <= CENTROID_LIMIT)
+    return observed
+
+
+def _value_variance(fits: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
+    """
+    Variance of the local value and its degrees of freedom.
+
+    The window of 4 x 4 kernels holds 16 h2 / 7 h2 = 2.3 times the effective number of observations of one field.
+    """
+    usable = (fits[..., 10] >= N_MINIMUM) & (fits[..., 12] > 0.0)
+    residual = uniform_filter(np.where(usable, fits[..., 11], 0.0), reach, mode="constant")
+    freedom = uniform_filter(np.where(usable, fits[..., 12], 0.0), reach, mode="constant")
+    factor = residual / np.maximum(freedom, 1e-12)
+    return np.maximum(factor, 1e-12) * fits[..., 3], np.maximum(2.3 * (fits[..., 10] - 3.0), 1.0)

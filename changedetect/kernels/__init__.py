@@ -1,0 +1,1 @@
+"""Compiled mathematics on plain arrays: no input or output, no logging, no exceptions."""

@@ -1,0 +1,425 @@
+"""
+Receptive fields computed from micro-cell moments, and their blending into one surface.
+
+A receptive field (RF) is a weighted local plane about its centre. Its activation is LWPR's bisquare kernel [1]_,
+w = (1 - q / 4)**2 for q = |x - c|**2 / h**2 < 4: the same curvature at the centre as exp(-q / 2), but of compact
+support, so that an RF touches only the cells within 2 h. RFs of one level stand on a square lattice of spacing
+0.8 h anchored at the origin of the CRS; RF (i, j) has its centre at ((j + 1/2), (i + 1/2)) spacings.
+
+References
+----------
+.. [1] S. Vijayakumar, A. D'Souza, S. Schaal (2005), Incremental online learning in high dimensions,
+   Neural Computation 17, 2602-2634.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+__all__ = ["N_FIT", "N_PLANE", "blend_planes", "fit_planes", "shrink_planes"]
+
+#: Columns of `fit_planes`: 0 value, 1 slope east * h, 2 slope north * h, 3-8 covariance of these (00 01 02 11 12 22),
+#: 9 sum of weights, 10 effective number of observations, 11 weighted residual sum, 12 its degrees of freedom,
+#: 13 centroid offset / h, 14 mean time, 15 mean weight of an observation.
+N_FIT = 16
+#: Rows of a level's planes: 0 value, 1 slope east, 2 slope north, 3 variance of the value, 4 blending weight,
+#: 5 noise variance of one observation, 6 support (1 or 0), 7 mean time, 8 shrinkage factor.
+N_PLANE = 9
+#: Ridge on slopes, in observations: keeps the plane of collinear cells defined.
+_RIDGE = 1e-3
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, first_column, fits):
+    """
+    Weighted local plane of every receptive field of a lattice block.
+
+    Parameters
+    ----------
+    window : array, shape (n_rows, n_columns, N_MOMENTS)
+        Moments of the cells, covering two kernel sizes around the block; weights are 1 / variance of an observation.
+    cell_size : float, m
+    row0, column0 : int
+        First row and column of the window.
+    kernel : float, m
+        Kernel size h.
+    spacing : float, m
+        Lattice spacing of the receptive fields.
+    first_row, first_column : int
+        Lattice indices of fits[0, 0].
+    fits : array, shape (n_i, n_j, N_FIT)
+        Filled in place; column 9 is 0 where a field has no cell at all.
+
+    Notes
+    -----
+    With v the weight of an observation (one over its variance), w its activation, A = sum w v xx' and
+    y = sum w v x z, beta = A^-1 y and cov(beta) = A^-1 (sum w2 v xx') A^-1 (sandwich). The plane inside a cell is exact; the activation is taken at
+    the mean position of the cell's observations.
+    """
+    radius = 2.0 * kernel
+    per_h = 1.0 / kernel
+    per_h2 = per_h * per_h
+    for i in prange(fits.shape[0]):
+        a_matrix = np.zeros((3, 3))
+        y0 = (first_row + i + 0.5) * spacing
+        a_low = max(0, int(math.floor((y0 - radius) / cell_size)) - row0)
+        a_high = min(window.shape[0] - 1, int(math.floor((y0 + radius) / cell_size)) - row0)
+        for j in range(fits.shape[1]):
+            x0 = (first_column + j + 0.5) * spacing
+            b_low = max(0, int(math.floor((x0 - radius) / cell_size)) - column0)
+            b_high = min(window.shape[1] - 1, int(math.floor((x0 + radius) / cell_size)) - column0)
+            s0 = s1 = s2 = s3 = s4 = s5 = 0.0
+            p0 = p1 = p2 = p3 = p4 = p5 = 0.0
+            z0 = z1 = z2 = zz = 0.0
+            count = time = 0.0
+            for a in range(a_low, a_high + 1):
+                v = (row0 + a + 0.5) * cell_size - y0
+                for b in range(b_low, b_high + 1):
+                    m = window[a, b]
+                    n = m[1]
+                    if n <= 0.0:
+                        continue
+                    u = (column0 + b + 0.5) * cell_size - x0
+                    du = u + m[2] / n
+                    dv = v + m[3] / n
+                    q = (du * du + dv * dv) * per_h2
+                    if q >= 4.0:
+                        continue
+                    w = 1.0 - 0.25 * q
+                    w *= w
+                    x1 = m[2] + n * u
+                    x2 = m[3] + n * v
+                    x3 = m[4] + u * (2.0 * m[2] + n * u)
+                    x4 = m[5] + u * m[3] + v * m[2] + n * u * v
+                    x5 = m[6] + v * (2.0 * m[3] + n * v)
+                    s0 += w * n
+                    s1 += w * x1
+                    s2 += w * x2
+                    s3 += w * x3
+                    s4 += w * x4
+                    s5 += w * x5
+                    w2 = w * w
+                    p0 += w2 * n
+                    p1 += w2 * x1
+                    p2 += w2 * x2
+                    p3 += w2 * x3
+                    p4 += w2 * x4
+                    p5 += w2 * x5
+                    z0 += w * m[7]
+                    z1 += w * (m[8] + u * m[7])
+                    z2 += w * (m[9] + v * m[7])
+                    zz += w * m[10]
+                    count += w * m[0]
+                    time += w * m[11]
+            o = fits[i, j]
+            o[9] = s0
+            if s0 <= 0.0:
+                continue
+            n_effective = s0 * s0 / p0
+            ridge = _RIDGE * s0 / n_effective
+            s1, s2, s3, s4, s5 = s1 * per_h, s2 * per_h, s3 * per_h2 + ridge, s4 * per_h2, s5 * per_h2 + ridge
+            p1, p2, p3, p4, p5 = p1 * per_h, p2 * per_h, p3 * per_h2, p4 * per_h2, p5 * per_h2
+            z1, z2 = z1 * per_h, z2 * per_h
+            # inverse of the symmetric 3 x 3 normal matrix
+            c00 = s3 * s5 - s4 * s4
+            c01 = s2 * s4 - s1 * s5
+            c02 = s1 * s4 - s2 * s3
+            det = s0 * c00 + s1 * c01 + s2 * c02
+            i00, i01, i02 = c00 / det, c01 / det, c02 / det
+            i11 = (s0 * s5 - s2 * s2) / det
+            i12 = (s1 * s2 - s0 * s4) / det
+            i22 = (s0 * s3 - s1 * s1) / det
+            o[0] = i00 * z0 + i01 * z1 + i02 * z2
+            o[1] = i01 * z0 + i11 * z1 + i12 * z2
+            o[2] = i02 * z0 + i12 * z1 + i22 * z2
+            # rows of A^-1 P, then A^-1 P A^-1
+            g00 = i00 * p0 + i01 * p1 + i02 * p2
+            g01 = i00 * p1 + i01 * p3 + i02 * p4
+            g02 = i00 * p2 + i01 * p4 + i02 * p5
+            g10 = i01 * p0 + i11 * p1 + i12 * p2
+            g11 = i01 * p1 + i11 * p3 + i12 * p4
+            g12 = i01 * p2 + i11 * p4 + i12 * p5
+            g20 = i02 * p0 + i12 * p1 + i22 * p2
+            g21 = i02 * p1 + i12 * p3 + i22 * p4
+            g22 = i02 * p2 + i12 * p4 + i22 * p5
+            o[3] = g00 * i00 + g01 * i01 + g02 * i02
+            o[4] = g00 * i01 + g01 * i11 + g02 * i12
+            o[5] = g00 * i02 + g01 * i12 + g02 * i22
+            o[6] = g10 * i01 + g11 * i11 + g12 * i12
+            o[7] = g10 * i02 + g11 * i12 + g12 * i22
+            o[8] = g20 * i02 + g21 * i12 + g22 * i22
+            o[10] = n_effective
+            o[11] = max(zz - o[0] * z0 - o[1] * z1 - o[2] * z2, 0.0)
+            trace = g00 + g11 + g22
+            o[12] = max(count - trace, 0.0)
+            o[13] = math.sqrt(s1 * s1 + s2 * s2) / s0
+            o[14] = time / s0
+            o[15] = s0 / count
+
+
+@njit(cache=True, error_model="numpy")
+def _information(o):
+    """beta' C^-1 beta of one fit: how many noise standard deviations, squared, its plane is away from zero."""
+    a, b, c, d, e, f = o[3], o[4], o[5], o[6], o[7], o[8]
+    c00 = d * f - e * e
+    c01 = c * e - b * f
+    c02 = b * e - c * d
+    det = a * c00 + b * c01 + c * c02
+    if not det > 0.0:
+        return 0.0
+    c11 = a * f - c * c
+    c12 = b * c - a * e
+    c22 = a * d - b * b
+    x, y, z = o[0], o[1], o[2]
+    q = x * x * c00 + y * y * c11 + z * z * c22 + 2.0 * (x * y * c01 + x * z * c02 + y * z * c12)
+    return max(q / det, 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def shrink_planes(fits, base, detail, kernel, n_minimum, shrinkage, planes):
+    """
+    Planes of one level: the coarser level's plane plus the shrunk plane of what it left over.
+
+    Parameters
+    ----------
+    fits : array, shape (n_i, n_j, N_FIT)
+        Local planes of the residuals.
+    base : array, shape (5, n_i, n_j)
+        Coarser surface at the centres: value, slope east, slope north, variance, defined (1 or 0).
+    detail : array, shape (n_i, n_j), m2
+        Typical variance of what this level adds around there; enters the variance where the data of a field cannot
+        tell.
+    kernel : float, m
+    n_minimum : float
+        Effective number of observations a field needs.
+    shrinkage : float
+        Strength c of the shrinkage; 0 takes every plane as fitted.
+    planes : array, shape (N_PLANE, n_i, n_j)
+        Filled in place.
+
+    Notes
+    -----
+    Empirical Bayes, James-Stein form: s = max(0, 1 - 3 c / q), q = beta' C^-1 beta averaged with the eight
+    neighbours, whose data overlap. The coarse estimate and this level's share their data, so with v the variance
+    of the coarse surface and C that of the unshrunk fine one the combination has variance (1 - s) v + s C; detail that
+    the field cannot see, of prior variance t, adds t A / (t + A) (1 - s) with A = C - v.
+    """
+    n_i, n_j = fits.shape[0], fits.shape[1]
+    information = np.full((n_i, n_j), -1.0)
+    for i in range(n_i):
+        for j in range(n_j):
+            if fits[i, j, 9] > 0.0 and fits[i, j, 10] >= n_minimum:
+                information[i, j] = min(_information(fits[i, j]), 1e4)
+    for i in range(n_i):
+        for j in range(n_j):
+            o = fits[i, j]
+            is_based = base[4, i, j] > 0.0
+            v = base[3, i, j] if is_based else 0.0
+            s = 0.0
+            added = detail[i, j]
+            if information[i, j] >= 0.0:
+                if is_based:
+                    total = weight = 0.0
+                    for a in range(max(0, i - 1), min(n_i, i + 2)):
+                        for b in range(max(0, j - 1), min(n_j, j + 2)):
+                            if information[a, b] >= 0.0:
+                                w = 1.0 if (a == i and b == j) else (0.36 if (a == i or b == j) else 0.13)
+                                total += w * information[a, b]
+                                weight += w
+                    q = total / weight
+                    s = max(0.0, 1.0 - 3.0 * shrinkage / max(q, 1e-12)) if shrinkage > 0.0 else 1.0
+                else:
+                    s = 1.0
+                unseen = max(o[3] - v, 0.0)
+                t = detail[i, j]
+                added = t * unseen / (t + unseen) * (1.0 - s) if t + unseen > 0.0 else 0.0
+            planes[8, i, j] = s
+            if not is_based and s == 0.0:
+                planes[4, i, j] = 0.0
+                continue
+            planes[0, i, j] = (base[0, i, j] if is_based else 0.0) + s * o[0]
+            planes[1, i, j] = (base[1, i, j] if is_based else 0.0) + s * o[1] / kernel
+            planes[2, i, j] = (base[2, i, j] if is_based else 0.0) + s * o[2] / kernel
+            planes[3, i, j] = (1.0 - s) * v + s * o[3] + added
+            gamma = detail[i, j] + 1e-8
+            if information[i, j] >= 0.0:
+                left = (1.0 - s) * (1.0 - s) * (o[0] * o[0] + 0.25 * (o[1] * o[1] + o[2] * o[2]))
+                gamma = o[11] / max(o[12] * o[15], 0.3 * o[9]) + left + 1e-8
+            elif o[9] > 0.0:
+                gamma += 10.0 / o[15]
+            planes[4, i, j] = 1.0 / gamma
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def blend_planes(easting, northing, planes, spacing, first_row, first_column, reach, blended):
+    """
+    Surface, slope and variance at scattered places: eq. 1 of the paper with weights w_k / Gamma_k.
+
+    Parameters
+    ----------
+    easting, northing : array, shape (n,), m
+    planes : array, shape (N_PLANE, n_i, n_j)
+    spacing : float, m
+    first_row, first_column : int
+        Lattice indices of planes[:, 0, 0].
+    reach : float
+        Radius of the blending kernel, lattice spacings.
+    blended : array, shape (n, 8)
+        Filled in place: value, slope east, slope north, variance, noise variance, support (0 to 1), mean time,
+        defined (1 or 0). The slopes are the exact derivative of the blend. Standard deviations are averaged, that is
+        neighbouring fields count as fully correlated.
+    """
+    k = int(math.ceil(reach))
+    radius = reach * spacing
+    per_r2 = 1.0 / (radius * radius)
+    n_i, n_j = planes.shape[1], planes.shape[2]
+    for p in prange(easting.size):
+        x, y = easting[p], northing[p]
+        i0 = int(math.floor(y / spacing)) - first_row
+        j0 = int(math.floor(x / spacing)) - first_column
+        w_sum = f_sum = wx = wy = fx = fy = sd = noise = support = time = flat = 0.0
+        for i in range(max(0, i0 - k), min(n_i, i0 + k + 1)):
+            dy = y - (first_row + i + 0.5) * spacing
+            for j in range(max(0, j0 - k), min(n_j, j0 + k + 1)):
+                g = planes[4, i, j]
+                if not g > 0.0:
+                    continue
+                dx = x - (first_column + j + 0.5) * spacing
+                q = (dx * dx + dy * dy) * per_r2
+                if q >= 1.0:
+                    continue
+                w = (1.0 - q) * (1.0 - q) * g
+                slope = -4.0 * (1.0 - q) * g * per_r2
+                f = planes[0, i, j] + planes[1, i, j] * dx + planes[2, i, j] * dy
+                w_sum += w
+                f_sum += w * f
+                wx += slope * dx
+                wy += slope * dy
+                fx += w * planes[1, i, j] + slope * dx * f
+                fy += w * planes[2, i, j] + slope * dy * f
+                sd += w * math.sqrt(planes[3, i, j])
+                noise += w * planes[5, i, j]
+                # support and time belong to the place, not to the better fit: no Gamma here
+                flat += w / g
+                support += w / g * planes[6, i, j]
+                time += w * planes[7, i, j]
+        o = blended[p]
+        if not w_sum > 0.0:
+            for c in range(8):
+                o[c] = 0.0
+            continue
+        f = f_sum / w_sum
+        o[0] = f
+        o[1] = (fx - f * wx) / w_sum
+        o[2] = (fy - f * wy) / w_sum
+        o[3] = (sd / w_sum) ** 2
+        o[4] = noise / w_sum
+        o[5] = support / flat
+        o[6] = time / w_sum
+        o[7] = 1.0
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def pool_noise(fits, reach, n_minimum, fallback, pooled):
+    """
+    Variance factor of the observations around each receptive field, insensitive to what its plane cannot follow.
+
+    Parameters
+    ----------
+    fits : array, shape (n_i, n_j, N_FIT)
+    reach : int
+        Fields up to this many lattice steps away take part.
+    n_minimum : float
+        Effective number of observations a field needs to take part.
+    fallback : float
+        Answer where fewer than three fields take part.
+    pooled : array, shape (n_i, n_j)
+        Filled in place: the median of residual sum / degrees of freedom, weighted by degrees of freedom and divided
+        by the median of chi-square with nu degrees over nu, (1 - 2 / (9 nu))**3 (Wilson and Hilferty 1931). Edges and
+        other ground that bends inside a kernel raise the mean of these ratios, but not their median while they are
+        the minority.
+    """
+    n_i, n_j = fits.shape[0], fits.shape[1]
+    side = 2 * reach + 1
+    for i in prange(n_i):
+        ratio = np.empty(side * side)
+        weight = np.empty(side * side)
+        for j in range(n_j):
+            n = 0
+            freedom = 0.0
+            for a in range(max(0, i - reach), min(n_i, i + reach + 1)):
+                for b in range(max(0, j - reach), min(n_j, j + reach + 1)):
+                    o = fits[a, b]
+                    if o[9] > 0.0 and o[10] >= n_minimum and o[12] > 0.25 * o[9] / o[15]:
+                        ratio[n] = o[11] / o[12]
+                        # degrees of freedom of the quadratic form, not of the weights: n_eff less the plane's three
+                        weight[n] = max(o[10] - 3.0, 1.0)
+                        freedom += weight[n]
+                        n += 1
+            if n < 3:
+                pooled[i, j] = fallback
+                continue
+            order = np.argsort(ratio[:n])
+            below = 0.0
+            k = 0
+            while k < n - 1 and below + weight[order[k]] < 0.5 * freedom:
+                below += weight[order[k]]
+                k += 1
+            nu = freedom / n
+            pooled[i, j] = ratio[order[k]] / (1.0 - 2.0 / (9.0 * nu)) ** 3
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def survey_support(window, cell_size, row0, column0, kernel, spacing, first_row, first_column, support):
+    """
+    What observations surround each receptive field, every one counting the same.
+
+    Parameters
+    ----------
+    window, cell_size, row0, column0, kernel, spacing, first_row, first_column
+        As for `fit_planes`.
+    support : array, shape (n_i, n_j, 4)
+        Filled in place: effective number of observations, distance of their centroid / kernel, mean time in days,
+        mean noise variance of one observation in m2.
+    """
+    radius = 2.0 * kernel
+    per_h2 = 1.0 / (kernel * kernel)
+    for i in prange(support.shape[0]):
+        y0 = (first_row + i + 0.5) * spacing
+        a_low = max(0, int(math.floor((y0 - radius) / cell_size)) - row0)
+        a_high = min(window.shape[0] - 1, int(math.floor((y0 + radius) / cell_size)) - row0)
+        for j in range(support.shape[1]):
+            x0 = (first_column + j + 0.5) * spacing
+            b_low = max(0, int(math.floor((x0 - radius) / cell_size)) - column0)
+            b_high = min(window.shape[1] - 1, int(math.floor((x0 + radius) / cell_size)) - column0)
+            s0 = s1 = s2 = p0 = time = variance = 0.0
+            for a in range(a_low, a_high + 1):
+                v = (row0 + a + 0.5) * cell_size - y0
+                for b in range(b_low, b_high + 1):
+                    m = window[a, b]
+                    n = m[0]
+                    if n <= 0.0:
+                        continue
+                    du = (column0 + b + 0.5) * cell_size - x0 + m[2] / m[1]
+                    dv = v + m[3] / m[1]
+                    q = (du * du + dv * dv) * per_h2
+                    if q >= 4.0:
+                        continue
+                    w = 1.0 - 0.25 * q
+                    w *= w * n
+                    s0 += w
+                    s1 += w * du
+                    s2 += w * dv
+                    p0 += w * w / n
+                    time += w * m[11] / m[1]
+                    variance += w * n / m[1]
+            o = support[i, j]
+            o[0] = o[1] = o[2] = o[3] = 0.0
+            if s0 > 0.0:
+                o[0] = s0 * s0 / p0
+                o[1] = math.sqrt(s1 * s1 + s2 * s2) / (s0 * kernel)
+                o[2] = time / s0
+                o[3] = variance / s0

@@ -1,0 +1,1 @@
+"""Surface models behind one protocol."""

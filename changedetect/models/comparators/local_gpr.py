@@ -1,0 +1,176 @@
+"""Local Gaussian process regression after Nguyen-Tuong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.spatial import cKDTree
+
+from changedetect.models.comparators.base import LocalAnswer, Observations, PointModel
+from changedetect.models.comparators.covariance import Covariance, Kernel, answer_from_moments, estimate_covariance
+
+if TYPE_CHECKING:
+    from changedetect.typing import FloatArray, IntArray
+
+__all__ = ["LocalGPR"]
+
+
+@dataclass(frozen=True, eq=False)
+class _LocalModel:
+    positions: FloatArray
+    mean: float
+    factor: FloatArray
+    weights: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _LocalModels:
+    centres: cKDTree
+    models: tuple[_LocalModel, ...]
+    width: float
+    covariance: Covariance
+
+
+@dataclass(kw_only=True, eq=False)
+class LocalGPR(PointModel[_LocalModels]):
+    """
+    Many small Gaussian processes, each for the observations around its centre, blended by distance (LGPR [1]_).
+
+    Attributes
+    ----------
+    points_per_model : int
+        Aimed at; sets the width of the weights from the density of the observations.
+    generation_threshold : float, between 0 and 1
+        An observation founds a new local model where all weights are at most this (w_gen).
+    n_blended : int
+        Nearest local models that answer together.
+    kernel : "matern32" or "rbf"
+    n_blocks, block_size : int
+        Subsample for the maximum-likelihood fit of the covariance; see `likelihood_blocks`.
+    random_seed : int
+        Of the subsample and of the order in which observations found models.
+    max_points : int or None
+
+    Notes
+    -----
+    Weights are w_k = exp(-|x - c_k|^2 / (2 width^2)), eq. 3 of [1]_; the answer is sum w_k m_k / sum w_k over the
+    nearest models, eq. 5. Its variance is that of the mixture, sum w_k (v_k + (m_k - m)^2) / sum w_k, its effective
+    number of observations the weighted mean of theirs. The paper moves a centre to the mean of its points as they
+    arrive and limits a model's size by removing points; here centres are found first, in random order, and each
+    observation then belongs to the nearest one. A model without information about a place is not blended.
+
+    References
+    ----------
+    .. [1] Nguyen-Tuong, D., Seeger, M. & Peters, J. (2009), Model learning with local Gaussian process regression,
+       Advanced Robotics 23(15), doi:10.1163/016918609X12529286896877.
+    """
+
+    points_per_model: int = 100
+    generation_threshold: float = 0.5
+    n_blended: int = 3
+    kernel: Kernel = "matern32"
+    n_blocks: int = 30
+    block_size: int = 64
+    random_seed: int = 0
+    max_points: int | None = 500_000
+
+    _block_size: ClassVar[int] = 100_000
+
+    def _estimate(self, observations: Observations) -> dict[str, float]:
+        return estimate_covariance(
+            observations,
+            self.kernel,
+            random_seed=self.random_seed,
+            n_blocks=self.n_blocks,
+            block_size=self.block_size,
+        ).to_parameters()
+
+    def _prepare(self, observations: Observations, parameters: dict[str, float]) -> _LocalModels:
+        covariance = Covariance.from_parameters(self.kernel, parameters)
+        positions = observations.positions
+        radius = _founding_radius(positions, self.points_per_model)
+        order = np.random.default_rng(self.random_seed).permutation(len(positions))
+        founders = _founders(positions, order, radius)
+        _, owner = cKDTree(positions[founders]).query(positions)
+        centres = np.column_stack([np.bincount(owner, axis) / np.bincount(owner) for axis in positions.T])
+        members = np.split(np.argsort(owner, kind="stable"), np.cumsum(np.bincount(owner))[:-1])
+        return _LocalModels(
+            centres=cKDTree(centres),
+            models=tuple(_local_model(observations, chosen, covariance) for chosen in members),
+            width=radius / float(np.sqrt(-2.0 * np.log(self.generation_threshold))),
+            covariance=covariance,
+        )
+
+    def _answer(self, prepared: _LocalModels, easting: FloatArray, northing: FloatArray) -> LocalAnswer:
+        places = np.column_stack([easting, northing])
+        n_blended = min(self.n_blended, len(prepared.models))
+        distance, nearest = prepared.centres.query(places, k=range(1, n_blended + 1))
+        # relative to the nearest centre: the ratio is the same, and nothing underflows far away
+        weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / prepared.width**2)
+        total, first, second, variance, n_effective = np.zeros((5, len(places)))
+        by_model = np.argsort(nearest, axis=None, kind="stable")
+        ends = np.cumsum(np.bincount(nearest.ravel(), minlength=len(prepared.models)))
+        for model, asked in zip(prepared.models, np.split(by_model, ends[:-1]), strict=True):
+            here, rank = np.divmod(asked, n_blended)
+            local = _local_answer(model, places[here], prepared.covariance)
+            share = np.where(local.n_effective > 0.0, weight[here, rank], 0.0)
+            total[here] += share
+            first[here] += share * local.elevation
+            second[here] += share * local.elevation**2
+            variance[here] += share * local.elevation_std**2
+            n_effective[here] += share * local.n_effective
+        norm = np.where(total > 0.0, total, 1.0)
+        elevation = first / norm
+        disagreement = np.maximum(second / norm - elevation**2, 0.0)
+        return LocalAnswer(
+            elevation=elevation,
+            elevation_std=np.sqrt(variance / norm + disagreement),
+            noise_std=np.full(elevation.shape, np.sqrt(prepared.covariance.noise_variance)),
+            n_effective=n_effective / norm,
+        )
+
+
+def _founding_radius(positions: FloatArray, points_per_model: int) -> float:
+    """
+    Distance at which a new local model is founded, so that models hold about `points_per_model` points.
+
+    Discs of diameter `radius` packed at random cover 0.547 of the ground at jamming, so centres no closer than
+    `radius` own 0.547^-1 pi radius^2 / 4 each. Density is the median over the neighbourhoods of the points.
+    """
+    k = min(points_per_model, len(positions))
+    sample = positions[:: max(1, len(positions) // 2000)]
+    to_kth = cKDTree(positions).query(sample, k=[k])[0][:, 0]
+    density = k / (np.pi * max(float(np.median(to_kth)) ** 2, 1e-12))
+    return float(np.sqrt(4.0 * 0.547 * points_per_model / (np.pi * density)))
+
+
+def _founders(positions: FloatArray, order: IntArray, radius: float) -> IntArray:
+    """Go through the points in `order`; one founds a model where no founder lies within `radius`."""
+    tree = cKDTree(positions)
+    is_free = np.ones(len(positions), dtype=np.bool_)
+    founders = []
+    for candidate in order:
+        if is_free[candidate]:
+            founders.append(candidate)
+            is_free[tree.query_ball_point(positions[candidate], radius)] = False
+    return np.array(founders, dtype=np.int64)
+
+
+def _local_model(observations: Observations, members: IntArray, covariance: Covariance) -> _LocalModel:
+    positions, elevation = observations.positions[members], observations.elevation[members]
+    system = covariance.between(positions, positions)
+    system[np.diag_indices_from(system)] += covariance.nugget + observations.variance[members]
+    factor = cholesky(system, lower=True)
+    mean = float(elevation.mean())
+    return _LocalModel(positions, mean, factor, cho_solve((factor, True), elevation - mean))
+
+
+def _local_answer(model: _LocalModel, places: FloatArray, covariance: Covariance) -> LocalAnswer:
+    cross = covariance.between(model.positions, places)
+    explained = np.sum(solve_triangular(model.factor, cross, lower=True) ** 2, axis=0)
+    return answer_from_moments(
+        covariance, model.mean + model.weights @ cross, covariance.signal_variance - explained
+    )

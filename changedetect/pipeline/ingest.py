@@ -1,0 +1,233 @@
+"""Adding a survey epoch: everything is read and checked before anything is written."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+from changedetect.catalogue import Epoch, Programme, Source, StateRecord, validate_epoch_id
+from changedetect.errors import InputDataError, MissingInputError, ModelStateError, OutputExistsError
+from changedetect.pipeline.lock import programme_lock
+from changedetect.pipeline.reading import read_epoch_points
+from changedetect.pipeline.regions import describe_region, regions_overlap
+from changedetect.storage import atomic_path, sha256_of_file
+from changedetect.typing import Region
+
+__all__ = ["AddedEpoch", "add_epoch"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddedEpoch:
+    """
+    An epoch as it was added.
+
+    Attributes
+    ----------
+    epoch : Epoch
+    n_points : int
+        Observations inside the programme's bounds.
+    region : tuple (west, east, south, north), m
+        Ground they cover.
+    is_late : bool
+        Whether later epochs exist, which are learned again after this one.
+    """
+
+    epoch: Epoch
+    n_points: int
+    region: Region
+    is_late: bool
+
+
+def add_epoch(
+    programme: Programme,
+    epoch_id: str,
+    sources: Sequence[Source],
+    date: datetime,
+    *,
+    label: str = "",
+    move: bool = False,
+    overwrite: bool = False,
+    dry_run: bool = False,
+) -> AddedEpoch:
+    """
+    Read and check the sources of a new epoch, and write `epochs/EPOCH_ID.toml`.
+
+    Parameters
+    ----------
+    programme : Programme
+    epoch_id : str
+    sources : sequence of Source
+        `uri` as the user gave it, relative to the working directory.
+    date : datetime
+    label : str
+    move : bool
+        Move the files into the programme's folder `sources/EPOCH_ID/`, last of all.
+    overwrite : bool
+        Replace an epoch of the same id.
+    dry_run : bool
+        Check everything and write nothing.
+
+    Returns
+    -------
+    AddedEpoch
+
+    Raises
+    ------
+    OutputExistsError
+        There is such an epoch already.
+    InputDataError
+        A source cannot be used, is in the programme already, or overlaps neither its bounds nor its other epochs.
+    MissingInputError, CRSMismatchError, VerticalDatumError, ConfigError, TemporaryError
+        As their names say.
+    """
+    validate_epoch_id(epoch_id)
+    if programme.epoch_path(epoch_id).exists() and not overwrite:
+        msg = f"Epoch '{epoch_id}' exists. Choose another id, or pass --overwrite to replace it."
+        raise OutputExistsError(msg)
+    if dry_run:
+        return _check(programme, epoch_id, sources, date, label)
+    with programme_lock(programme.directory):
+        added = _check(programme, epoch_id, sources, date, label)
+        epoch = _copied(programme, added.epoch) if move else added.epoch
+        programme.write_epoch(epoch)
+        if move:
+            _remove_originals(programme, added.epoch, epoch)
+    return replace(added, epoch=epoch)
+
+
+def _check(programme: Programme, epoch_id: str, sources: Sequence[Source], date: datetime, label: str) -> AddedEpoch:
+    found = tuple(_described(programme, source) for source in sources)
+    _require_new_files(programme, epoch_id, found)
+    epoch = Epoch(epoch_id=epoch_id, date=date, sources=found, label=label)
+    ordered = programme.with_epoch(epoch)
+    points = read_epoch_points(programme, epoch)
+    _require_overlap(programme, epoch_id, points.cloud.region)
+    read = zip(epoch.sources, points.records, strict=True)
+    counted = tuple(replace(source, n_points=record.n_read) for source, record in read)
+    return AddedEpoch(
+        epoch=replace(epoch, sources=counted, region=points.cloud.region),
+        n_points=len(points.cloud),
+        region=points.cloud.region,
+        is_late=ordered[-1].epoch_id != epoch_id,
+    )
+
+
+def _described(programme: Programme, source: Source) -> Source:
+    """Return the source with its checksum, its path as the programme is to remember it."""
+    path = Path(source.uri).expanduser().resolve()
+    if path.is_dir():
+        msg = f"'{source.uri}' is a folder. Name the files in it, for example {source.uri}/*.laz."
+        raise InputDataError(msg)
+    sha256 = sha256_of_file(path)
+    home = programme.directory.resolve()
+    uri = path.relative_to(home).as_posix() if path.is_relative_to(home) else path.as_posix()
+    return replace(source, uri=uri, sha256=sha256, size=path.stat().st_size)
+
+
+def _require_new_files(programme: Programme, epoch_id: str, sources: Sequence[Source]) -> None:
+    """Refuse a file whose content the programme has in this or another epoch, under whatever name."""
+    known: dict[str, str] = {}
+    for epoch in programme.epochs:
+        if epoch.epoch_id == epoch_id:
+            continue
+        known |= dict.fromkeys(_known_checksums(programme, epoch), f"epoch '{epoch.epoch_id}'")
+    for source in sources:
+        checksum = source.sha256 or ""
+        if checksum in known:
+            msg = (
+                f"'{source.uri}' is in the programme already, in {known[checksum]} (same content, SHA-256 "
+                f"{checksum[:12]}...). A survey counts once; leave the file out."
+            )
+            raise InputDataError(msg)
+        known[checksum] = f"this epoch, as '{source.name}'"
+
+
+def _known_checksums(programme: Programme, epoch: Epoch) -> list[str]:
+    """Checksums pinned in the epoch's file, or else those found when it was learned, or else those on disk."""
+    if all(source.sha256 for source in epoch.sources):
+        return [source.sha256 for source in epoch.sources if source.sha256]
+    record = _intact_record(programme, epoch)
+    if record is not None:
+        return [source.sha256 for source in record.sources]
+    checksums = []
+    for source in epoch.sources:
+        try:
+            checksums.append(sha256_of_file(source.path(programme.directory)))
+        except MissingInputError as error:
+            logger.warning("Epoch %s: %s", epoch.epoch_id, error)
+    return checksums
+
+
+def _require_overlap(programme: Programme, epoch_id: str, region: Region) -> None:
+    """Refuse an epoch that shares no ground with any other: its CRS is wrong, or it is another site."""
+    others = {
+        epoch.epoch_id: _known_region(programme, epoch) for epoch in programme.epochs if epoch.epoch_id != epoch_id
+    }
+    known = {name: other for name, other in others.items() if other is not None}
+    if not known or any(regions_overlap(region, other) for other in known.values()):
+        return
+    name, other = list(known.items())[-1]
+    msg = (
+        f"The sources do not overlap the programme: they span {describe_region(region)} in {programme.config.crs}, "
+        f"epoch '{name}' spans {describe_region(other)}. Check the CRS of the files (--crs) and whether they are of "
+        "this site."
+    )
+    raise InputDataError(msg)
+
+
+def _known_region(programme: Programme, epoch: Epoch) -> Region | None:
+    if epoch.region is not None:
+        return epoch.region
+    record = _intact_record(programme, epoch)
+    return None if record is None else record.region
+
+
+def _intact_record(programme: Programme, epoch: Epoch) -> StateRecord | None:
+    try:
+        found = programme.state_record(epoch.epoch_id)
+    except ModelStateError as error:
+        logger.warning("%s", error)
+        return None
+    return None if found is None else found[0]
+
+
+def _copied(programme: Programme, epoch: Epoch) -> Epoch:
+    """Put the files of an epoch, under their own names, into the programme's folder; the originals stay for now."""
+    folder = programme.sources_directory(epoch.epoch_id)
+    names = [source.name for source in epoch.sources]
+    if len({*names}) < len(names):
+        msg = f"Sources that are moved need different file names, not {', '.join(names)}. Rename one of them."
+        raise InputDataError(msg)
+    moved = []
+    for source in epoch.sources:
+        original, target = source.path(programme.directory), folder / source.name
+        if original != target:
+            with atomic_path(target) as temporary:
+                _link_or_copy(original, temporary)
+        moved.append(replace(source, uri=target.relative_to(programme.directory).as_posix()))
+    return replace(epoch, sources=tuple(moved))
+
+
+def _link_or_copy(original: Path, target: Path) -> None:
+    try:
+        os.link(original, target)
+    except OSError:  # another file system, or one without links
+        shutil.copy2(original, target)
+
+
+def _remove_originals(programme: Programme, before: Epoch, after: Epoch) -> None:
+    for old, new in zip(before.sources, after.sources, strict=True):
+        original, kept = (source.path(programme.directory).resolve() for source in (old, new))
+        if original == kept:
+            continue
+        try:
+            original.unlink()
+        except OSError as error:  # the epoch is complete; a copy too many does no harm
+            logger.warning("'%s' was copied to '%s' but cannot be removed: %s", original, kept, error.strerror)

@@ -1,0 +1,158 @@
+"""Learning the model of an epoch from that of its parent and its own points."""
+
+from __future__ import annotations
+
+import logging
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import changedetect
+from changedetect.catalogue import Epoch, Programme, SourceRecord, StateRecord, checksums, own_state_reasons
+from changedetect.errors import ModelStateError
+from changedetect.models.lwpr import LWPRSurface
+from changedetect.models.reference import ReferenceLWPR
+from changedetect.models.registry import create_model, load_model, save_model
+from changedetect.pipeline.manifest import utc_now
+from changedetect.pipeline.reading import read_epoch_points
+from changedetect.storage import atomic_directory
+
+__all__ = ["Model", "ModelShelf", "learn_epoch"]
+
+logger = logging.getLogger(__name__)
+
+Model: TypeAlias = LWPRSurface | ReferenceLWPR
+
+
+@dataclass(frozen=True)
+class _Learned:
+    """A model, the sources its epoch was learned from, and whether they were read again."""
+
+    model: Model
+    sources: tuple[SourceRecord, ...]
+    n_points: int
+    origin: Literal["sources", "stored evidence"]
+
+
+class ModelShelf:
+    """
+    Models of a programme, loaded when first needed; the few used last stay in memory.
+
+    Parameters
+    ----------
+    programme : Programme
+    capacity : int
+        Two epochs of a difference and the next one.
+    """
+
+    def __init__(self, programme: Programme, capacity: int = 3) -> None:
+        self._programme = programme
+        self._capacity = capacity
+        self._models: OrderedDict[str, Model] = OrderedDict()
+
+    def put(self, epoch_id: str, model: Model) -> None:
+        """Keep a model that was just learned."""
+        self._models[epoch_id] = model
+        self._models.move_to_end(epoch_id)
+        while len(self._models) > self._capacity:
+            self._models.popitem(last=False)
+
+    def get(self, epoch_id: str) -> Model:
+        """
+        Return the model of an epoch; not to be modified.
+
+        Raises
+        ------
+        ModelStateError
+            The stored model is damaged.
+        """
+        if epoch_id not in self._models:
+            self.put(epoch_id, load_model(self._programme.state_directory(epoch_id)))
+        self._models.move_to_end(epoch_id)
+        return self._models[epoch_id]
+
+
+def learn_epoch(programme: Programme, epoch: Epoch, parent: Epoch | None, models: ModelShelf) -> dict[str, Any]:
+    """
+    Learn the model of an epoch and put it in place of an older one, whole.
+
+    Parameters
+    ----------
+    programme : Programme
+    epoch : Epoch
+    parent : Epoch or None
+        The epoch before, learned already; None where this is the first.
+    models : ModelShelf
+        Gives the parent's model, receives the new one.
+
+    Returns
+    -------
+    details : dict
+        For the run's manifest.
+
+    Raises
+    ------
+    MissingInputError, InputDataError
+        The sources cannot be used; what was learned before stays.
+
+    Notes
+    -----
+    Where nothing but the parent has changed, the model is put on its new parent from its own evidence, without reading
+    the sources again, if its kind keeps evidence.
+    """
+    learned = _rebuild(programme, epoch, parent, models) or _learn_points(programme, epoch, parent, models)
+    _write_state(programme, epoch, parent, learned)
+    models.put(epoch.epoch_id, learned.model)
+    return {
+        "parent": parent.epoch_id if parent else None,
+        "n_points": learned.n_points,
+        "origin": learned.origin,
+        "sources": [{"uri": item.uri, "sha256": item.sha256, "n_used": item.n_used} for item in learned.sources],
+    }
+
+
+def _learn_points(programme: Programme, epoch: Epoch, parent: Epoch | None, models: ModelShelf) -> _Learned:
+    points = read_epoch_points(programme, epoch)
+    model = models.get(parent.epoch_id).copy() if parent else create_model(programme.config)
+    cloud = points.cloud
+    model.partial_fit(cloud.coordinates, cloud.elevation, cloud.sigma, epoch.survey_time)
+    return _Learned(model, points.records, len(cloud), "sources")
+
+
+def _rebuild(programme: Programme, epoch: Epoch, parent: Epoch | None, models: ModelShelf) -> _Learned | None:
+    """Put the epoch's stored model on its new parent; None where the sources have to be read."""
+    if own_state_reasons(programme, epoch):
+        return None
+    found = programme.state_record(epoch.epoch_id)
+    try:
+        model = load_model(programme.state_directory(epoch.epoch_id))
+    except ModelStateError as error:
+        logger.warning("%s Learning from the sources instead.", error)
+        return None
+    parent_model = models.get(parent.epoch_id) if parent else None
+    if found is None or not isinstance(model, LWPRSurface) or not isinstance(parent_model, LWPRSurface | None):
+        return None
+    return _Learned(model.rebuilt_on(parent_model), found[0].sources, found[0].n_points, "stored evidence")
+
+
+def _write_state(programme: Programme, epoch: Epoch, parent: Epoch | None, learned: _Learned) -> None:
+    parent_record = programme.state_record(parent.epoch_id) if parent else None
+    config = programme.config
+    with atomic_directory(programme.state_directory(epoch.epoch_id)) as temporary:
+        save_model(learned.model, temporary)
+        StateRecord(
+            epoch_id=epoch.epoch_id,
+            mode=config.model,
+            survey_time=epoch.survey_time,
+            parent=parent.epoch_id if parent else None,
+            parent_sha256=parent_record[1] if parent_record else None,
+            settings=config.learning_settings,
+            learning_sha256=config.learning_sha256,
+            config_sha256=config.config_sha256,
+            sources=learned.sources,
+            n_points=learned.n_points,
+            region=learned.model.region,
+            files=checksums(temporary),
+            software_version=changedetect.__version__,
+            created=utc_now(),
+        ).write(temporary)

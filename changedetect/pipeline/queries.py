@@ -1,0 +1,303 @@
+"""Asking a learned model: at the places of a table, on a grid, between two epochs."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from itertools import islice
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from changedetect.catalogue import MANIFEST_FILE, Programme, plan
+from changedetect.errors import InputDataError, MissingInputError, OutputExistsError
+from changedetect.io.cog import write_cog
+from changedetect.io.netcdf import SURFACE_LAYERS, SurfaceMetadata, write_surface
+from changedetect.pipeline.learn import ModelShelf
+from changedetect.pipeline.manifest import new_run_id, utc_now
+from changedetect.pipeline.products import make_pair_products, predict_layers, product_grid
+from changedetect.storage import atomic_path
+from changedetect.typing import Coordinates, FloatArray, JSONObject, Region
+
+__all__ = ["difference_epochs", "predict_table", "require_model", "write_epoch_surface"]
+
+#: Columns that `predict_table` writes after easting and northing.
+PREDICTED_COLUMNS = ("elevation", "elevation_std", "noise_std", "n_effective")
+_EASTING_NAMES = ("easting", "easting_m", "east", "e", "x")
+_NORTHING_NAMES = ("northing", "northing_m", "north", "n", "y")
+_ROWS_AT_A_TIME = 200_000
+
+
+def require_model(programme: Programme, epoch_id: str) -> str | None:
+    """
+    Check that the model of an epoch can be asked.
+
+    Returns
+    -------
+    warning : str or None
+        Why the model is not up to date.
+
+    Raises
+    ------
+    MissingInputError
+        There is no such epoch, or it has not been learned.
+    """
+    programme.epoch(epoch_id)
+    if not programme.state_directory(epoch_id).is_dir():
+        msg = f"Epoch '{epoch_id}' has not been learned. Run: changedetect update {programme.directory}"
+        raise MissingInputError(msg)
+    items = [item for item in plan(programme) if item.kind == "model" and item.item_id == epoch_id and item.is_due]
+    return f"the model of {epoch_id} is not up to date: {'; '.join(items[0].reasons)}" if items else None
+
+
+def predict_table(
+    programme: Programme, epoch_id: str, points: Path, output: Path, *, overwrite: bool = False
+) -> JSONObject:
+    """
+    Predict the surface of an epoch at the places of a table.
+
+    Parameters
+    ----------
+    programme : Programme
+    epoch_id : str
+    points : Path
+        CSV file with columns easting and northing (or x and y) in the programme's CRS, m; other columns are left
+        out. Without a header the first two columns count.
+    output : Path
+        CSV file with easting, northing, elevation, elevation_std, noise_std (m) and n_effective; "nan" where no data
+        supports an answer. Numbers are written so that they read back bit for bit.
+    overwrite : bool
+
+    Returns
+    -------
+    details : dict
+        Counts of the places, and of those without an answer.
+
+    Raises
+    ------
+    MissingInputError, InputDataError
+        The table or the model is missing; the table holds something else than numbers: the message names the line.
+    OutputExistsError
+        The output exists.
+    """
+    require_absent(output, overwrite=overwrite)
+    model = ModelShelf(programme).get(epoch_id)
+    n_points = n_unknown = 0
+    with _open_table(points) as stream, atomic_path(output) as temporary, temporary.open("w", newline="") as target:
+        writer = csv.writer(target, lineterminator="\n")
+        writer.writerow(("easting", "northing", *PREDICTED_COLUMNS))
+        for easting, northing in _coordinate_blocks(stream, points):
+            prediction = model.predict((easting, northing))
+            columns = [easting, northing, *(getattr(prediction, name) for name in PREDICTED_COLUMNS)]
+            writer.writerows(zip(*(map(repr, column.tolist()) for column in columns), strict=True))
+            n_points += easting.size
+            n_unknown += int(np.count_nonzero(np.isnan(prediction.elevation)))
+        if n_points == 0:
+            msg = f"'{points}' holds no places: rows of easting and northing are expected."
+            raise InputDataError(msg)
+    return {"output": str(output), "n_points": n_points, "n_without_answer": n_unknown}
+
+
+def write_epoch_surface(
+    programme: Programme,
+    epoch_id: str,
+    output: Path,
+    *,
+    layer: str = "elevation",
+    resolution: float | None = None,
+    bounds: Region | None = None,
+    overwrite: bool = False,
+) -> JSONObject:
+    """
+    Write the surface of an epoch as one raster.
+
+    Parameters
+    ----------
+    programme : Programme
+    epoch_id : str
+    output : Path
+        ``.tif`` for one layer as Cloud Optimized GeoTIFF, ``.nc`` for all layers as CF NetCDF.
+    layer : str
+        Of `SURFACE_LAYERS`; for a GeoTIFF.
+    resolution : float, m, optional
+    bounds : tuple (west, east, south, north), m, optional
+        The programme's own by default.
+    overwrite : bool
+
+    Returns
+    -------
+    details : dict
+
+    Raises
+    ------
+    InputDataError
+        The file's suffix or the layer is not known.
+    OutputExistsError
+        The output exists.
+    """
+    if output.suffix.lower() not in {".tif", ".tiff", ".nc"}:
+        msg = f"'{output}' ends neither in .tif (one layer) nor in .nc (all layers)."
+        raise InputDataError(msg)
+    require_absent(output, overwrite=overwrite)
+    config, epoch = programme.config, programme.epoch(epoch_id)
+    model = ModelShelf(programme).get(epoch_id)
+    grid = product_grid(config, model.region, resolution=resolution, bounds=bounds)
+    layers = predict_layers(model, grid)
+    meta = SurfaceMetadata(
+        programme=config.name,
+        run_id=new_run_id(),
+        config_sha256=config.config_sha256,
+        created=utc_now(),
+        epoch=epoch_id,
+        datetime=epoch.date.isoformat(),
+    )
+    if output.suffix.lower() == ".nc":
+        write_surface(output, layers, grid, meta)
+    else:
+        described = SURFACE_LAYERS[layer]
+        write_cog(
+            output,
+            layers[layer],
+            grid,
+            nodata=math.nan,
+            description=described.long_name,
+            unit=described.unit,
+            tags={key: str(value) for key, value in asdict(meta).items() if value} | {"layer": layer},
+        )
+    known = float(np.mean(np.isfinite(layers["elevation"])))
+    return {"output": str(output), "shape": list(grid.shape), "region": list(grid.region), "covered_share": known}
+
+
+def difference_epochs(
+    programme: Programme, earlier: str, later: str, directory: Path, *, overwrite: bool = False
+) -> JSONObject:
+    """
+    Write the products of one pair of epochs into any folder.
+
+    Parameters
+    ----------
+    programme : Programme
+    earlier, later : str
+        Epoch ids, in the order of time.
+    directory : Path
+        Replaced as a whole where it holds such products already and `overwrite` is set.
+    overwrite : bool
+
+    Returns
+    -------
+    details : dict
+        As `make_pair_products`.
+
+    Raises
+    ------
+    OutputExistsError
+        The folder holds something else, or `overwrite` is not set.
+    """
+    require_replaceable(directory, overwrite=overwrite)
+    pair = programme.pair(earlier, later)
+    return make_pair_products(programme, pair, ModelShelf(programme), new_run_id(), directory)
+
+
+def require_absent(output: Path, *, overwrite: bool) -> None:
+    """
+    Refuse to replace a file unless asked to.
+
+    Raises
+    ------
+    OutputExistsError
+    """
+    if output.is_dir():
+        msg = f"'{output}' is a folder; name a file."
+        raise OutputExistsError(msg)
+    if output.exists() and not overwrite:
+        msg = f"'{output}' exists. Choose another name, or pass --overwrite to replace it."
+        raise OutputExistsError(msg)
+
+
+def require_replaceable(directory: Path, *, overwrite: bool) -> None:
+    """
+    Refuse to replace a folder unless it is empty, or holds products and replacing was asked for.
+
+    Raises
+    ------
+    OutputExistsError
+    """
+    if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
+        return
+    if not (directory / MANIFEST_FILE).is_file():
+        msg = f"'{directory}' exists and holds something else than products. Choose another folder."
+        raise OutputExistsError(msg)
+    if not overwrite:
+        msg = f"'{directory}' holds products already. Choose another folder, or pass --overwrite to replace them."
+        raise OutputExistsError(msg)
+
+
+def _coordinate_blocks(stream: TextIO, path: Path) -> Iterator[Coordinates]:
+    """Yield easting and northing of some rows at a time."""
+    rows = enumerate(csv.reader(stream), start=1)
+    try:
+        first = next(((line, row) for line, row in rows if row), None)
+        if first is None:
+            return
+        columns = _columns(first[1], path)
+        head = [first] if columns is None else []
+        easting, northing = (0, 1) if columns is None else columns
+        while True:
+            block = [*head, *((line, row) for line, row in islice(rows, _ROWS_AT_A_TIME) if row)]
+            head = []
+            if not block:
+                return
+            yield _numbers(block, easting, path), _numbers(block, northing, path)
+    except UnicodeDecodeError as error:
+        msg = f"'{path}' is not a table of text: byte {error.start} is not UTF-8."
+        raise InputDataError(msg) from error
+
+
+def _columns(header: Sequence[str], path: Path) -> tuple[int, int] | None:
+    """Return where easting and northing stand; None for a first row of numbers."""
+    names = [name.strip().lower().lstrip("\ufeff") for name in header]
+    if names[:2] and all(_is_number(name) for name in names[:2]):
+        if len(names) < 2:
+            msg = f"'{path}', line 1: easting and northing are needed, separated by a comma; got {header!r}."
+            raise InputDataError(msg)
+        return None
+    found = []
+    for wanted in (_EASTING_NAMES, _NORTHING_NAMES):
+        index = next((names.index(name) for name in wanted if name in names), None)
+        if index is None:
+            msg = (
+                f"'{path}' has no column '{wanted[0]}' (or {', '.join(wanted[1:])}); its header says "
+                f"{', '.join(header)}. Columns are separated by commas."
+            )
+            raise InputDataError(msg)
+        found.append(index)
+    return found[0], found[1]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers(block: Sequence[tuple[int, Sequence[str]]], column: int, path: Path) -> FloatArray:
+    values = np.empty(len(block))
+    for index, (line, row) in enumerate(block):
+        text = row[column] if column < len(row) else ""
+        if not _is_number(text) or not math.isfinite(float(text)):
+            msg = f"'{path}', line {line}: {text!r} is no finite coordinate in metres."
+            raise InputDataError(msg)
+        values[index] = float(text)
+    return values
+
+
+def _open_table(path: Path) -> TextIO:
+    if not path.is_file():
+        msg = f"No such file: {path}. Check the name and the folder."
+        raise MissingInputError(msg)
+    return path.open(encoding="utf-8", newline="")

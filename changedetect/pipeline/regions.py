@@ -1,0 +1,32 @@
+"""Regions (west, east, south, north) of ground: joining, comparing, telling."""
+
+from __future__ import annotations
+
+from changedetect.typing import Region
+
+__all__ = ["describe_region", "join_regions", "regions_overlap"]
+
+
+def join_regions(one: Region | None, other: Region) -> Region:
+    """
+    Smallest region around both; None is nothing.
+
+    Examples
+    --------
+    >>> join_regions((0.0, 2.0, 0.0, 2.0), (1.0, 3.0, -1.0, 1.0))
+    (0.0, 3.0, -1.0, 2.0)
+    """
+    if one is None:
+        return other
+    return min(one[0], other[0]), max(one[1], other[1]), min(one[2], other[2]), max(one[3], other[3])
+
+
+def regions_overlap(one: Region, other: Region) -> bool:
+    """Whether two regions share a point."""
+    return one[0] <= other[1] and other[0] <= one[1] and one[2] <= other[3] and other[2] <= one[3]
+
+
+def describe_region(region: Region) -> str:
+    """Say where a region lies, for messages."""
+    west, east, south, north = region
+    return f"easting {west:.1f} to {east:.1f}, northing {south:.1f} to {north:.1f}"
