@@ -107,7 +107,8 @@ def atomic_directory(target: Path) -> Iterator[Path]:
     Parameters
     ----------
     target : path
-        Folder to publish. An existing folder is replaced as a whole; its old files do not survive.
+        Folder to publish. An existing folder is replaced as a whole; its old files do not survive. A symbolic link to
+        a folder stays, and what it points to is replaced.
 
     Yields
     ------
@@ -125,7 +126,7 @@ def atomic_directory(target: Path) -> Iterator[Path]:
     `NAME.old-<pid>-<random>`. A process killed between the two renames leaves no `target` and a complete old folder,
     which `clear_leftovers` puts back.
     """
-    target = Path(target)
+    target = Path(target).resolve()
     temporary = _sibling(target, "tmp")
     _require_writable_folder(target.parent, temporary)
     if target.exists() and not target.is_dir():

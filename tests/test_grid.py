@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -16,7 +16,7 @@ CRS = "EPSG:32632+5773"
 
 resolutions = st.sampled_from([0.05, 0.1, 0.25, 1 / 3, 0.5, 0.7, 1.0, 2.5, 30.0])
 offsets = st.floats(0, 1, exclude_max=True)
-counts = st.integers(1, 60)
+counts = st.integers(1, 25)
 
 
 @st.composite
@@ -40,6 +40,7 @@ def test_centres_and_borders_of_a_small_grid():
     assert easting.dtype == northing.dtype == np.float64
 
 
+@settings(deadline=None)
 @given(
     st.floats(-1e6, 1e6),
     st.floats(-1e7, 1e7),
@@ -75,6 +76,7 @@ def test_grid_from_a_point_is_one_cell():
     assert grid.region == (10.0, 10.5, 5.0, 5.5)
 
 
+@settings(deadline=None)
 @given(grids(), st.integers(1, 40))
 def test_blocks_tile_the_grid_with_bit_identical_centres(grid, size):
     covered = np.zeros(grid.shape, dtype=int)
@@ -88,6 +90,7 @@ def test_blocks_tile_the_grid_with_bit_identical_centres(grid, size):
     assert_array_equal(covered, 1)
 
 
+@settings(deadline=None)
 @given(grids(), st.integers(0, 30))
 def test_padded_grid_holds_the_same_cells(grid, n):
     padded = grid.pad(n)
@@ -96,6 +99,7 @@ def test_padded_grid_holds_the_same_cells(grid, n):
     assert_array_equal(padded.northing[n : n + grid.n_rows], grid.northing)
 
 
+@settings(deadline=None)
 @given(grids())
 def test_centres_lie_half_a_cell_inside_the_borders(grid):
     west, east, south, north = grid.region

@@ -155,6 +155,24 @@ def test_old_folder_survives_an_error_in_the_block(tmp_path):
     assert list(tmp_path.iterdir()) == [target]
 
 
+def test_folder_behind_a_link_is_replaced_and_the_link_stays(tmp_path):
+    (tmp_path / "disk" / "product").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "disk" / "product")
+    with atomic_directory(tmp_path / "link") as folder:
+        (folder / "new").touch()
+    assert (tmp_path / "link").is_symlink()
+    assert [p.name for p in (tmp_path / "disk" / "product").iterdir()] == ["new"]
+    assert [p.name for p in (tmp_path / "disk").iterdir()] == ["product"]
+
+
+def test_current_folder_can_be_published(tmp_path, monkeypatch):
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path / "out")
+    with atomic_directory(Path()) as folder:
+        (folder / "new").touch()
+    assert (tmp_path / "out" / "new").exists()
+
+
 def test_folder_does_not_replace_a_file(tmp_path):
     (tmp_path / "product").write_text("keep")
     with pytest.raises(OutputError, match="a file of that name exists"), atomic_directory(tmp_path / "product"):

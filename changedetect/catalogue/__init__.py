@@ -21,8 +21,8 @@ from changedetect.catalogue.records import (
     ProductRecord,
     SourceRecord,
     StateRecord,
-    checksums,
     damaged_files,
+    describe_files,
 )
 from changedetect.catalogue.staleness import (
     Item,
@@ -44,8 +44,8 @@ __all__ = [
     "Source",
     "SourceRecord",
     "StateRecord",
-    "checksums",
     "damaged_files",
+    "describe_files",
     "epoch_product_reasons",
     "own_state_reasons",
     "pair_reasons",

@@ -216,18 +216,19 @@ def read_epoch(path: Path) -> Epoch:
         msg = f"{path}: format_version = {version!r}; this version of changedetect reads {EPOCH_FORMAT_VERSION}."
         raise ConfigError(msg)
     epoch_id = validate_epoch_id(path.name.removesuffix(".toml"))
-    sources = table.pop("sources", [])
+    sources, moment = table.get("sources"), table.get("date")
     if not isinstance(sources, list) or not sources:
         msg = f"{path}: an epoch needs at least one table [[sources]] with a uri."
         raise ConfigError(msg)
-    tables = [_with_tuples(source) for source in sources]
-    built = tuple(build_from_table(Source, table, f"{path}, [[sources]] {n}") for n, table in enumerate(tables, 1))
-    moment = table.pop("date", None)
     if not isinstance(moment, str | date):
         msg = f"{path}: date = {moment!r}; the date of the survey is needed, like date = 2024-05-01."
         raise ConfigError(msg)
-    known = {"epoch_id": epoch_id, "date": parse_date(moment, f"{path}: date"), "sources": built}
-    return build_from_table(Epoch, known | _with_tuples(table), str(path), hidden=("epoch_id",))
+    table["sources"] = [
+        build_from_table(Source, _with_tuples(source), f"{path}, [[sources]] {number}")
+        for number, source in enumerate(sources, start=1)
+    ]
+    table["date"] = parse_date(moment, f"{path}: date")
+    return build_from_table(Epoch, _with_tuples(table), str(path), epoch_id=epoch_id)
 
 
 def _with_tuples(table: Any) -> dict[str, Any]:

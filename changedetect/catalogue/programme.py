@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,10 +20,13 @@ from changedetect.config import (
     format_toml_value,
     load_config,
 )
-from changedetect.errors import ConfigError, InputDataError, MissingInputError, OutputExistsError
+from changedetect.crs import check_programme_crs
+from changedetect.errors import ConfigError, InputDataError, MissingInputError, ModelStateError, OutputExistsError
 from changedetect.storage import atomic_path
 
 __all__ = ["ChangeProduct", "Programme"]
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,8 @@ class Programme:
             There is a programme already.
         ConfigError
             A setting is not allowed.
+        CRSMismatchError
+            The CRS is unknown, or not projected in metres.
         OutputError
             The folder cannot be written.
         """
@@ -86,6 +92,7 @@ class Programme:
             raise OutputExistsError(msg)
         given = {key: value for key, value in settings.items() if value is not None}
         config = load_config(directory, environment={}, programme=given).config
+        check_programme_crs(config.crs)
         if not dry_run:
             with atomic_path(path) as temporary:
                 temporary.write_text(_programme_text(given, config), encoding="utf-8")
@@ -109,6 +116,8 @@ class Programme:
             There is no programme.
         ConfigError
             A setting is unknown or not allowed.
+        CRSMismatchError
+            The CRS is unknown, or not projected in metres.
         """
         if not (directory / PROGRAMME_FILE).is_file():
             msg = (
@@ -116,7 +125,9 @@ class Programme:
                 f"Make one with: changedetect init {directory} --crs EPSG:..."
             )
             raise MissingInputError(msg)
-        return cls(directory, load_config(directory, config_files=config_files, environment=environment, flags=flags))
+        loaded = load_config(directory, config_files=config_files, environment=environment, flags=flags)
+        check_programme_crs(loaded.config.crs)
+        return cls(directory, loaded)
 
     @property
     def config(self) -> ProgrammeConfig:
@@ -235,6 +246,15 @@ class Programme:
     def state_record(self, epoch_id: str) -> tuple[StateRecord, str] | None:
         """Manifest of an epoch's model and its SHA-256; None where the epoch has not been learned."""
         return StateRecord.read(self.state_directory(epoch_id))
+
+    def intact_state_record(self, epoch_id: str) -> StateRecord | None:
+        """Manifest of an epoch's model; None, with a logged warning, where it is damaged."""
+        try:
+            found = self.state_record(epoch_id)
+        except ModelStateError as error:
+            logger.warning("%s", error)
+            return None
+        return found[0] if found else None
 
     def product_record(self, product_id: str) -> tuple[ProductRecord, str] | None:
         """Manifest of a folder of products and its SHA-256; None where there is none."""

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self, TypeVar
 from changedetect.errors import ModelStateError
 from changedetect.storage import read_json, sha256_of_file, write_json
 
-__all__ = ["MANIFEST_FILE", "ProductRecord", "SourceRecord", "StateRecord", "checksums", "damaged_files"]
+__all__ = ["MANIFEST_FILE", "ProductRecord", "SourceRecord", "StateRecord", "damaged_files", "describe_files"]
 
 MANIFEST_FILE = "manifest.json"
 
@@ -114,7 +114,7 @@ class StateRecord(_Manifest):
         Observations learned in this epoch.
     region : tuple (west, east, south, north), m
         Ground the model has observed up to this epoch.
-    files : mapping of file name to SHA-256
+    files : mapping of file name to its size, bytes, and SHA-256
     software_version, created : str
     """
 
@@ -131,7 +131,7 @@ class StateRecord(_Manifest):
     sources: tuple[SourceRecord, ...]
     n_points: int
     region: tuple[float, float, float, float]
-    files: Mapping[str, str]
+    files: Mapping[str, Mapping[str, Any]]
     software_version: str
     created: str
 
@@ -161,7 +161,7 @@ class ProductRecord(_Manifest):
     colour_limits : mapping of layer to (low, high)
         Limits of the styles; the programme's other maps take them over.
     warnings : tuple of str
-    files : mapping of file name to SHA-256
+    files : mapping of file name to its size, bytes, and SHA-256
     software_version, run_id, created : str
     """
 
@@ -174,7 +174,7 @@ class ProductRecord(_Manifest):
     region: tuple[float, float, float, float]
     colour_limits: Mapping[str, tuple[float, float]]
     warnings: tuple[str, ...]
-    files: Mapping[str, str]
+    files: Mapping[str, Mapping[str, Any]]
     software_version: str
     run_id: str
     created: str
@@ -195,15 +195,18 @@ def _from_document(owner: type[T], document: Mapping[str, Any], path: Path) -> T
     return owner(**{name: document[name] for name in names})
 
 
-def checksums(directory: Path) -> dict[str, str]:
-    """SHA-256 of every file below a folder, by its path relative to it, without the manifest."""
+def describe_files(directory: Path) -> dict[str, dict[str, Any]]:
+    """Size (bytes) and SHA-256 of every file below a folder, by its path relative to it, without the manifest."""
     paths = sorted(path for path in directory.rglob("*") if path.is_file() and path.name != MANIFEST_FILE)
-    return {path.relative_to(directory).as_posix(): sha256_of_file(path) for path in paths}
+    return {
+        path.relative_to(directory).as_posix(): {"size": path.stat().st_size, "sha256": sha256_of_file(path)}
+        for path in paths
+    }
 
 
-def damaged_files(directory: Path, files: Mapping[str, str], *, deep: bool) -> list[str]:
+def damaged_files(directory: Path, files: Mapping[str, Mapping[str, Any]], *, deep: bool) -> list[str]:
     """
-    Say which of a manifest's files are missing or, with `deep`, differ from their checksums.
+    Say which of a manifest's files are missing, have another size or, with `deep`, another checksum.
 
     Returns
     -------
@@ -214,6 +217,8 @@ def damaged_files(directory: Path, files: Mapping[str, str], *, deep: bool) -> l
         path = directory / name
         if not path.is_file():
             complaints.append(f"{name} is missing")
-        elif deep and sha256_of_file(path) != expected:
+        elif path.stat().st_size != expected["size"]:
+            complaints.append(f"{name} has {path.stat().st_size} bytes, was written with {expected['size']}")
+        elif deep and sha256_of_file(path) != expected["sha256"]:
             complaints.append(f"{name} differs from its checksum")
     return complaints

@@ -58,17 +58,8 @@ class Item:
         return bool(self.reasons)
 
 
-def plan(programme: Programme, rule: str | None = None) -> tuple[Item, ...]:
-    """
-    List models, epoch products and pair products in the order they are made, each with why it is due.
-
-    Parameters
-    ----------
-    programme : Programme
-    rule : {"consecutive", "first", "all"}, optional
-        Rule for the differences; the programme's own by default. Differences that exist already are kept current
-        whatever the rule says.
-    """
+def plan(programme: Programme) -> tuple[Item, ...]:
+    """List models, epoch products and pair products in the order they are made, each with why it is due."""
     models = []
     states: dict[str, str] = {}
     parent: Epoch | None = None
@@ -79,14 +70,18 @@ def plan(programme: Programme, rule: str | None = None) -> tuple[Item, ...]:
         states[epoch.epoch_id] = record[1] if record else _TO_BE_LEARNED
         parent = epoch
     surfaces = [Item("epoch", name, epoch_product_reasons(programme, name, states)) for name in states]
-    pairs = wanted_pairs(programme, rule, list(states))
+    pairs = wanted_pairs(programme, list(states))
     changes = [Item("pair", pair.product_id, pair_reasons(programme, pair, states)) for pair in pairs]
     return (*models, *surfaces, *changes)
 
 
-def wanted_pairs(programme: Programme, rule: str | None, epoch_ids: Sequence[str]) -> tuple[ChangeProduct, ...]:
-    """Differences that the rule asks for, and those that exist, among the given epochs."""
-    asked = programme.pairs(rule, epoch_ids)
+def wanted_pairs(programme: Programme, epoch_ids: Sequence[str]) -> tuple[ChangeProduct, ...]:
+    """
+    Return the differences among the given epochs, in order of time, that a programme is to have.
+
+    Those its rule asks for, and those that exist: what was once published is kept current.
+    """
+    asked = programme.pairs(epoch_ids=epoch_ids)
     kept = [pair for pair in programme.existing_pairs() if {pair.earlier, pair.later} <= {*epoch_ids}]
     return (*asked, *(pair for pair in kept if pair not in asked))
 

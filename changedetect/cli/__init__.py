@@ -43,12 +43,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     is_json = wants_json(arguments)
     try:
-        result: Any = app(args=list(arguments), standalone_mode=False)
+        result: Any = app(args=list(arguments), prog_name="changedetect", standalone_mode=False)
     except ChangeDetectError as error:
         return print_error(error, error.exit_code, is_json=is_json)
     except typer.TyperException as error:
-        if is_json:
-            return print_error(error, error.exit_code, is_json=True)
+        if is_json or not hasattr(error, "show"):
+            return print_error(error, error.exit_code, is_json=is_json)
         error.show()
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from changedetect.catalogue import Programme
     from changedetect.pipeline.update import Progress
 
-__all__ = ["JSON_FORMAT_VERSION", "Outcome", "Session", "command", "print_error", "wants_json"]
+__all__ = ["COMMON_OPTIONS", "JSON_FORMAT_VERSION", "Outcome", "Session", "command", "print_error", "wants_json"]
 
 #: Version of the documents that --json prints.
 JSON_FORMAT_VERSION = 1
@@ -110,7 +110,7 @@ class Outcome:
     exit_code: int = 0
 
 
-_CommonOptions = {
+COMMON_OPTIONS = {
     "json_output": Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")],
     "quiet": Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")],
     "verbose": Annotated[bool, typer.Option("--verbose", "-v", help="Log every step.")],
@@ -145,7 +145,7 @@ def command(app: typer.Typer, name: str, prefix: str = "") -> Callable[[Callable
         own = list(inspect.signature(function).parameters.values())[1:]
 
         def run(**values: Any) -> int:
-            common = {key: values.pop(key) for key in _CommonOptions}
+            common = {key: values.pop(key) for key in COMMON_OPTIONS}
             session = Session(
                 command=prefix + name,
                 is_json=common["json_output"],
@@ -162,7 +162,7 @@ def command(app: typer.Typer, name: str, prefix: str = "") -> Callable[[Callable
         parameters = [parameter.replace(annotation=hints[parameter.name]) for parameter in own]
         parameters += [
             inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=_COMMON_DEFAULTS[key], annotation=annotation)
-            for key, annotation in _CommonOptions.items()
+            for key, annotation in COMMON_OPTIONS.items()
         ]
         parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
         run.__signature__ = inspect.Signature(parameters, return_annotation=int)  # type: ignore[attr-defined]

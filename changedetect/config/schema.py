@@ -63,7 +63,7 @@ class AdaptiveConfig:
     kernel_max_m: Annotated[float, Field(gt=0)] | None = None
     kernel_ratio: Annotated[float, Field(gt=1, lt=4)] = 1.4142
     lattice_spacing: Annotated[float, Field(gt=0, le=2)] = 0.8
-    shrinkage: Annotated[float, Field(ge=0)] = 1.0
+    shrinkage: Annotated[float, Field(ge=0)] = 0.7
     prior_observations: Annotated[float, Field(ge=0)] = 1.0
     outlier_threshold: Annotated[float, Field(ge=0)] = 6.0
 
@@ -76,12 +76,51 @@ class AdaptiveConfig:
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class LWPRConfig:
-    """Settings of the reference mode, the algorithm of Vijayakumar, D'Souza and Schaal (2005)."""
+    """
+    Settings of the reference mode, the algorithm of Vijayakumar, D'Souza and Schaal (2005).
 
+    Attributes
+    ----------
+    kernel : {"gaussian", "bisquare"}
+        Shape of the activation.
+    activation_threshold : float
+        A point that activates no receptive field more than this gets a new one.
+    prune_threshold : float
+        Of two receptive fields that a point activates more than this, one goes; 1 switches it off.
+    initial_kernel_m : float or None, m
+        Kernel of a new receptive field; None chooses it from the density of the first points.
+    observations_per_field : float
+        Activation mass that this choice aims at.
+    initial_forgetting_factor, final_forgetting_factor, forgetting_annealing : float
+        The forgetting factor of a receptive field goes from the first to the second, at a pace given by the third.
+    learn_metric, diagonal_metric : bool
+        Adapt each kernel by gradient descent on the leave-one-out error; its axes stay aligned with the grid.
+    learning_rate, penalty : float or None
+        Of that descent; None scales those of the published library to the first kernel.
+    meta_learning, meta_rate : bool, float
+        Adapt the learning rates too (incremental delta-bar-delta).
+    cutoff : float
+        A receptive field answers where its activation exceeds this.
+    noise_prior_observations : float
+        Weight of the pooled noise variance in each receptive field's own, as a number of observations.
+    """
+
+    kernel: Literal["gaussian", "bisquare"] = "gaussian"
     activation_threshold: Annotated[float, Field(gt=0, lt=1)] = 0.1
     prune_threshold: Annotated[float, Field(gt=0, le=1)] = 1.0
     initial_kernel_m: Annotated[float, Field(gt=0)] | None = None
+    observations_per_field: Annotated[float, Field(gt=0)] = 16.0
+    initial_forgetting_factor: Annotated[float, Field(gt=0, le=1)] = 0.99
+    final_forgetting_factor: Annotated[float, Field(gt=0, le=1)] = 0.999
+    forgetting_annealing: Annotated[float, Field(ge=0, le=1)] = 0.9995
     learn_metric: bool = False
+    diagonal_metric: bool = True
+    learning_rate: Annotated[float, Field(gt=0)] | None = None
+    penalty: Annotated[float, Field(ge=0)] | None = None
+    meta_learning: bool = False
+    meta_rate: Annotated[float, Field(ge=0)] = 250.0
+    cutoff: Annotated[float, Field(ge=0, lt=1)] = 0.001
+    noise_prior_observations: Annotated[float, Field(gt=0)] = 4.0
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)

@@ -74,7 +74,7 @@ def describe_unknown_key(name: str, allowed: Iterable[str]) -> str:
     return f"{meant} Allowed there: {', '.join(allowed)}."
 
 
-def build_from_table(owner: type[T], table: Mapping[str, Any], place: str, hidden: Iterable[str] = ()) -> T:
+def build_from_table(owner: type[T], table: Mapping[str, Any], place: str, **known: Any) -> T:
     """
     Construct a frozen value from a table of a TOML file.
 
@@ -84,21 +84,21 @@ def build_from_table(owner: type[T], table: Mapping[str, Any], place: str, hidde
     table : mapping
     place : str
         File, and table in it, for messages.
-    hidden : iterable of str
-        Fields that the file does not state.
+    **known
+        Fields that the file may not state.
 
     Raises
     ------
     ConfigError
         A key is unknown or missing, or a value is not allowed.
     """
-    allowed = [field.name for field in fields(owner)]  # type: ignore[arg-type]
+    allowed = [field.name for field in fields(owner) if field.name not in known]  # type: ignore[arg-type]
     for key in table:
         if key not in allowed:
-            msg = f"{place}: unknown key '{key}'.{describe_unknown_key(key, sorted({*allowed} - {*hidden}))}"
+            msg = f"{place}: unknown key '{key}'.{describe_unknown_key(key, allowed)}"
             raise ConfigError(msg)
     try:
-        return owner(**table)
+        return owner(**table, **known)
     except ValidationError as error:
         item = error.errors()[0]
         key = ".".join(str(part) for part in item["loc"])

@@ -174,14 +174,17 @@ def to_wkt(text: str, version: Literal["WKT2", "WKT1"] = "WKT2") -> str:
     Raises
     ------
     CRSMismatchError
-        `text` is not a CRS, or WKT1 cannot express it (projected with ellipsoidal heights).
+        `text` is not a CRS, or has ellipsoidal heights and WKT1 is asked for.
     """
-    versions = {"WKT2": WktVersion.WKT2_2019, "WKT1": WktVersion.WKT1_GDAL}
-    try:
-        return str(parse_crs(text).to_wkt(versions[version]))
-    except CRSError as error:
-        msg = f"{crs_name(text)!r} cannot be written as {version}: {error}. Write WKT2, or declare levelled heights."
-        raise CRSMismatchError(msg) from error
+    crs = parse_crs(text)
+    vertical = vertical_crs(crs)
+    if version == "WKT1" and vertical is not None and vertical.is_geographic:
+        msg = (
+            f"{crs_name(text)!r} cannot be written as WKT1, which knows no ellipsoidal heights beside a projection. "
+            "Write WKT2, or declare levelled heights."
+        )
+        raise CRSMismatchError(msg)
+    return str(crs.to_wkt(WktVersion.WKT2_2019 if version == "WKT2" else WktVersion.WKT1_GDAL))
 
 
 def to_cf(text: str) -> dict[str, Any]:

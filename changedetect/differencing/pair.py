@@ -69,8 +69,8 @@ def _difference_adaptive(
     lattice = Lattice(
         0.0, grid.resolution, round(south / grid.resolution), round(west / grid.resolution), grid.n_rows, grid.n_cols
     )
-    kernel = max(earlier.own_kernel_, later.own_kernel_)
-    local = estimate_difference(earlier.own_cells(), later.own_cells(), kernel, lattice)
+    kernels = (earlier.own_kernel_, later.own_kernel_)
+    local = estimate_difference(earlier.own_cells(), later.own_cells(), kernels, lattice)
     return _north_up(local, settings)
 
 

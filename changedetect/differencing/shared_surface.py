@@ -25,11 +25,11 @@ __all__ = ["LocalDifference", "estimate_difference"]
 
 #: Rounds of alternation between f0 and d; the third changes neither by more than 1 % of the noise.
 _ROUNDS = 3
-#: Kernel of f0 in the finest kernels the thinner epoch supports. With 1.0 f0 follows the noise and 7 % of unchanged
-#: cells were flagged at 9 observations a m2; with 1.4 it was 5.2 %.
+#: Kernel of f0 in the finest the denser epoch supports. With 1.0 f0 follows the noise and 7 % of unchanged cells were
+#: flagged at 9 observations a m2; with 1.4 it was 5.2 %.
 _SHARED_KERNEL = 2.0**0.5
-#: Kernel of d in kernels of f0.
-_CHANGE_KERNEL = 2.0
+#: Kernel of d in the finest the thinner epoch supports.
+_CHANGE_KERNEL = 2.0**1.5
 #: Area over which a field averages, in squared kernels: n_eff = 20/9 pi h2 per unit density for the bisquare kernel.
 FIELD_AREA = 20.0 / 9.0 * np.pi
 _SPACING = 0.8
@@ -66,12 +66,12 @@ def _joint_region(earlier: Cells, later: Cells) -> Region:
 
 
 def _surface(cells: Cells, region: Region, kernel: float) -> Level:
-    return build_level(cells, region, kernel, _SPACING * kernel, 0.0, None)
+    return build_level(cells, Lattice.covering(region, kernel, _SPACING * kernel), 0.0, None)
 
 
 def _without(cells: Cells, level: Level, sign: float = 1.0) -> Cells:
     """Cells less sign * level; where the level is not defined nothing is taken off."""
-    return cells.with_plane_removed(sign * level.blend(*cells.centres))
+    return cells.with_surface_removed(sign * level.blend(*cells.places))
 
 
 def _change(earlier: Cells, later: Cells, region: Region, kernel: float) -> Level:
@@ -84,7 +84,9 @@ def _change(earlier: Cells, later: Cells, region: Region, kernel: float) -> Leve
     return Level(b.lattice, planes)
 
 
-def estimate_difference(earlier: Cells, later: Cells, kernel: float, lattice: Lattice) -> LocalDifference:
+def estimate_difference(
+    earlier: Cells, later: Cells, kernels: tuple[float, float], lattice: Lattice
+) -> LocalDifference:
     """
     Later minus earlier surface, its variance, and where both saw the ground.
 
@@ -92,8 +94,9 @@ def estimate_difference(earlier: Cells, later: Cells, kernel: float, lattice: La
     ----------
     earlier, later : Cells
         Evidence of the two epochs, weights 1 / variance of an observation.
-    kernel : float, m
-        The finest that the thinner of the two epochs supports.
+    kernels : (earlier, later), m
+        The finest that each epoch's density supports. The shared surface follows the denser epoch, the difference
+        the thinner one.
     lattice : Lattice
         Output cells; only its spacing and extent matter.
 
@@ -107,8 +110,8 @@ def estimate_difference(earlier: Cells, later: Cells, kernel: float, lattice: La
     freedom, both summed over a window of two kernels either side; observations are taken as independent.
     """
     region = _joint_region(earlier, later)
-    fine = _SHARED_KERNEL * kernel
-    wide = _CHANGE_KERNEL * fine
+    fine = _SHARED_KERNEL * min(kernels)
+    wide = _CHANGE_KERNEL * max(kernels)
     change: Level | None = None
     left: tuple[Cells, Cells] = (earlier, later)
     for _ in range(_ROUNDS):

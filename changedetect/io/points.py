@@ -8,6 +8,7 @@ a LAS file without a suffix is read as LAS, a text file called .laz is refused.
 from __future__ import annotations
 
 import logging
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
@@ -128,19 +129,33 @@ def iter_programme_chunks(
     InputDataError
         A point cannot be terrain (NaN, infinite, absurd, evidently degrees), or there are fewer than ten points.
     """
-    where = str(source.path)
-    transform = make_transform(source.require_crs(), programme_crs, coordinate_epoch=coordinate_epoch)
     n_points = 0
+    with _naming(source.path):
+        transform = make_transform(source.require_crs(), programme_crs, coordinate_epoch=coordinate_epoch)
     for chunk in source.iter_chunks(chunk_size):
+        where = f"{source.path}, points from {n_points} on" if n_points else str(source.path)
         check_finite(chunk, where)
-        easting, northing, elevation = transform(*chunk.coordinates, chunk.elevation)
+        with _naming(source.path):
+            easting, northing, elevation = transform(*chunk.coordinates, chunk.elevation)
         cloud = PointCloud(easting, northing, elevation, chunk.sigma, chunk.classification)
         check_values(cloud, where)
         if transform.is_identity and n_points == 0:
             check_not_degrees(cloud, where)
         n_points += len(cloud)
         yield cloud
-    check_count(n_points, where)
+    check_count(n_points, str(source.path))
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Put the name of the source before messages about its CRS."""
+    try:
+        yield
+    except InputDataError as error:
+        if str(error).startswith(str(path)):
+            raise
+        msg = f"{path}: {error}"
+        raise type(error)(msg) from error
 
 
 def detect_format(path: Path) -> Format:

@@ -100,11 +100,11 @@ class Parameters(NamedTuple):
         A field is added where no activation exceeds w_gen, and pruned where a second one exceeds w_prune.
     init_lambda, final_lambda, tau_lambda : float
         Forgetting: lambda moves from its first to its last value as lambda <- tau lambda + (1 - tau) final.
-    init_S2 : float
+    init_s2 : float
         Start value of SSs2.
-    init_M_xx, init_M_xy, init_M_yy : float
+    init_m_xx, init_m_xy, init_m_yy : float
         Upper triangular factor of the metric of new fields.
-    update_D, diag_only, meta : bool
+    update_d, diag_only, meta : bool
         Learn metrics; only the diagonal of M; with adaptive learning rates.
     penalty, init_alpha, meta_rate : float
         Weight of the penalty on D, first learning rate of M, and the rate at which learning rates adapt.
@@ -118,15 +118,14 @@ class Parameters(NamedTuple):
     init_lambda: float = 0.999
     final_lambda: float = 0.99999
     tau_lambda: float = 0.9999
-    init_S2: float = 1e-10
-    init_M_xx: float = 5.0
-    init_M_xy: float = 0.0
-    init_M_yy: float = 5.0
-    update_D: bool = True
+    init_s2: float = 1e-10
+    init_m_xx: float = 5.0
+    init_m_xy: float = 0.0
+    init_m_yy: float = 5.0
+    update_d: bool = True
     diag_only: bool = True
     meta: bool = False
     penalty: float = 1e-6
     init_alpha: float = 50.0
     meta_rate: float = 250.0
     survey_time: float = 0.0
-

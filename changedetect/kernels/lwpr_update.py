@@ -50,9 +50,7 @@ def squared_distance(rf: np.void, x: float, y: float) -> float:
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def update_field(
-    rf: np.void, x: float, y: float, target: float, w: float
-) -> tuple[float, float, float, float, float]:
+def update_field(rf: np.void, x: float, y: float, target: float, w: float) -> tuple[float, float, float, float, float]:
     """
     Learn one sample in one receptive field: all but the metric, and the count, which comes last of all.
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import numba.core
 import numpy as np
-from numba import config, types
-from numba.core import cgutils
+from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 __all__ = ["aligned_records", "prefetch"]
 
 _LINE = 64
+# numba's code generation and its configuration carry no types
+_cgutils: Any = numba.core.cgutils
+_config: Any = numba.core.config
 
 
 def aligned_records(capacity: int, dtype: np.dtype[np.void]) -> NDArray[np.void]:
@@ -33,7 +36,7 @@ def aligned_records(capacity: int, dtype: np.dtype[np.void]) -> NDArray[np.void]
     return buffer[offset : offset + capacity * dtype.itemsize].view(dtype)
 
 
-def _prefetch_record(typing_context: Any, records: Any, i: Any) -> Any:
+def _prefetch_record(_typing_context: Any, records: Any, i: Any) -> Any:  # noqa: ARG001
     """
     Ask for all cache lines of records[i] without waiting for them.
 
@@ -44,13 +47,13 @@ def _prefetch_record(typing_context: Any, records: Any, i: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array_type = signature.args[0]
         array = context.make_array(array_type)(context, builder, arguments[0])
-        element = cgutils.get_item_pointer(context, builder, array_type, array, [arguments[1]])
-        record = builder.bitcast(element, cgutils.voidptr_t)
-        kind = cgutils.ir.FunctionType(cgutils.ir.VoidType(), [cgutils.voidptr_t] + 3 * [cgutils.int32_t])
-        hint = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        options = [cgutils.int32_t(0), cgutils.int32_t(3), cgutils.int32_t(1)]  # for reading, all caches, data
+        element = _cgutils.get_item_pointer(context, builder, array_type, array, [arguments[1]])
+        record = builder.bitcast(element, _cgutils.voidptr_t)
+        kind = _cgutils.ir.FunctionType(_cgutils.ir.VoidType(), [_cgutils.voidptr_t] + 3 * [_cgutils.int32_t])
+        hint = _cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        options = [_cgutils.int32_t(0), _cgutils.int32_t(3), _cgutils.int32_t(1)]  # for reading, all caches, data
         for line in range(0, context.get_abi_sizeof(context.get_data_type(array_type.dtype)), _LINE):
-            builder.call(hint, [builder.gep(record, [cgutils.intp_t(line)]), *options])
+            builder.call(hint, [builder.gep(record, [_cgutils.intp_t(line)]), *options])
         return context.get_dummy_value()
 
     return signature, generate
@@ -60,4 +63,4 @@ def _no_prefetch(records: NDArray[Any], i: int) -> None:
     """Do nothing: interpreted code has nothing to hint at."""
 
 
-prefetch = _no_prefetch if config.DISABLE_JIT else intrinsic(_prefetch_record)
+prefetch: Any = _no_prefetch if _config.DISABLE_JIT else intrinsic(_prefetch_record)

@@ -16,7 +16,8 @@ Lanes 8 to 10 may wrap around 2**64; `cell_moments` centres them on the cell's m
 exact although its parts wrapped.
 
 Lanes of the floating-point moments (`N_MOMENTS` columns), in metres about the cell centre and about elevation zero:
-the same eleven with weights in units of one, then 11: sum of w times observation time in days.
+the same eleven with weights in units of one, then 11: sum of w times observation time in days, 12: sum of the noise
+variances of the observations, m2 (one over the weight until the noise has been estimated).
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ __all__ = [
 ]
 
 N_SUMS = 11
-N_MOMENTS = 12
+N_MOMENTS = 13
 #: Quantum of elevation, m.
 ELEVATION_UNIT = 2.0**-13
 #: Quantum of an offset inside a cell, in cell sizes.
@@ -249,6 +250,7 @@ def moments_from_sums(sums, cell_size, weight_unit, time):
         m[9] = ayz * (ux * uz) * weight_unit + z0 * m[3]
         m[10] = azz * (uz * uz) * weight_unit + 2.0 * z0 * cz + z0 * z0 * w
         m[11] = w * time
+        m[12] = m[0] * m[0] / w
     return moments
 
 
@@ -297,6 +299,7 @@ def _add_recentred(m, u, v, o):
     o[9] += m[9] + v * m[7]
     o[10] += m[10]
     o[11] += m[11]
+    o[12] += m[12]
 
 
 @njit(cache=True, error_model="numpy")

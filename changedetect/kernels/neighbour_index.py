@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 #: Cells along one side of the bounding box of the largest ellipse of a level.
-_CELLS_ACROSS = 6.0
+_CELLS_ACROSS = 5.0
 #: Most cells an ellipse can touch: one more than its size along each axis, and one for rounding.
 ENTRY_CELLS = int(_CELLS_ACROSS + 2) ** 2
 #: Entries of a cell record; with its key, count and link it fills 64 bytes.
@@ -276,7 +276,7 @@ def prefetch_cells(index: NeighbourIndex, x: float, y: float) -> None:
 @njit(cache=True, error_model="numpy", nogil=True)
 def _cell(coordinate: float, size: float) -> int:
     """Cell number along one axis; absurd coordinates are clipped to what an integer holds."""
-    return int(math.floor(min(max(coordinate / size, -1e15), 1e15)))
+    return math.floor(min(max(coordinate / size, -1e15), 1e15))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

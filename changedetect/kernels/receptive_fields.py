@@ -22,10 +22,10 @@ from numba import njit, prange
 __all__ = ["N_FIT", "N_PLANE", "blend_planes", "fit_planes", "shrink_planes"]
 
 #: Columns of `fit_planes`: 0 value, 1 slope east * h, 2 slope north * h, 3-8 covariance of these (00 01 02 11 12 22),
-#: 9 sum of weights, 10 effective number of observations, 11 weighted residual sum, 12 its degrees of freedom,
+#: 9 sum of weights, 10 effective number of observations, 11 weighted residual sum, 12 its expectation under the noise variances stated,
 #: 13 centroid offset / h, 14 mean time, 15 mean weight of an observation.
 N_FIT = 16
-#: Rows of a level's planes: 0 value, 1 slope east, 2 slope north, 3 variance of the value, 4 blending weight,
+#: Rows of a level's planes: 0 value, 1 slope east, 2 slope north, 3 variance of the surface, 4 blending weight,
 #: 5 noise variance of one observation, 6 support (1 or 0), 7 mean time, 8 shrinkage factor.
 N_PLANE = 9
 #: Ridge on slopes, in observations: keeps the plane of collinear cells defined.
@@ -40,7 +40,7 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
     Parameters
     ----------
     window : array, shape (n_rows, n_columns, N_MOMENTS)
-        Moments of the cells, covering two kernel sizes around the block; weights are 1 / variance of an observation.
+        Moments of the cells, covering two kernel sizes around the block; weights are about 1 / noise variance.
     cell_size : float, m
     row0, column0 : int
         First row and column of the window.
@@ -55,8 +55,10 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
 
     Notes
     -----
-    With v the weight of an observation (one over its variance), w its activation, A = sum w v xx' and
-    y = sum w v x z, beta = A^-1 y and cov(beta) = A^-1 (sum w2 v xx') A^-1 (sandwich). The plane inside a cell is exact; the activation is taken at
+    With v the weight of an observation, w its activation, A = sum w v xx' and
+    y = sum w v x z, beta = A^-1 y and cov(beta) = A^-1 (sum w2 v2 s2 xx') A^-1 with s2 the
+    noise variance of each observation (sandwich); the residual sum's expectation is sum w v s2 less the trace of
+    A^-1 (sum w2 v2 s2 xx'). The plane inside a cell is exact; the activation is taken at
     the mean position of the cell's observations.
     """
     radius = 2.0 * kernel
@@ -72,9 +74,9 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
             b_low = max(0, int(math.floor((x0 - radius) / cell_size)) - column0)
             b_high = min(window.shape[1] - 1, int(math.floor((x0 + radius) / cell_size)) - column0)
             s0 = s1 = s2 = s3 = s4 = s5 = 0.0
-            p0 = p1 = p2 = p3 = p4 = p5 = 0.0
+            t0 = t1 = t2 = t3 = t4 = t5 = 0.0
             z0 = z1 = z2 = zz = 0.0
-            count = time = 0.0
+            count = time = p0 = expected = 0.0
             for a in range(a_low, a_high + 1):
                 v = (row0 + a + 0.5) * cell_size - y0
                 for b in range(b_low, b_high + 1):
@@ -101,13 +103,17 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
                     s3 += w * x3
                     s4 += w * x4
                     s5 += w * x5
-                    w2 = w * w
-                    p0 += w2 * n
-                    p1 += w2 * x1
-                    p2 += w2 * x2
-                    p3 += w2 * x3
-                    p4 += w2 * x4
-                    p5 += w2 * x5
+                    p0 += w * w * n
+                    # weight times noise variance of this cell's observations: 1 where the weights are right
+                    f = n * m[12] / (m[0] * m[0])
+                    expected += w * m[0] * f
+                    f *= w * w
+                    t0 += f * n
+                    t1 += f * x1
+                    t2 += f * x2
+                    t3 += f * x3
+                    t4 += f * x4
+                    t5 += f * x5
                     z0 += w * m[7]
                     z1 += w * (m[8] + u * m[7])
                     z2 += w * (m[9] + v * m[7])
@@ -121,7 +127,7 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
             n_effective = s0 * s0 / p0
             ridge = _RIDGE * s0 / n_effective
             s1, s2, s3, s4, s5 = s1 * per_h, s2 * per_h, s3 * per_h2 + ridge, s4 * per_h2, s5 * per_h2 + ridge
-            p1, p2, p3, p4, p5 = p1 * per_h, p2 * per_h, p3 * per_h2, p4 * per_h2, p5 * per_h2
+            t1, t2, t3, t4, t5 = t1 * per_h, t2 * per_h, t3 * per_h2, t4 * per_h2, t5 * per_h2
             z1, z2 = z1 * per_h, z2 * per_h
             # inverse of the symmetric 3 x 3 normal matrix
             c00 = s3 * s5 - s4 * s4
@@ -135,16 +141,16 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
             o[0] = i00 * z0 + i01 * z1 + i02 * z2
             o[1] = i01 * z0 + i11 * z1 + i12 * z2
             o[2] = i02 * z0 + i12 * z1 + i22 * z2
-            # rows of A^-1 P, then A^-1 P A^-1
-            g00 = i00 * p0 + i01 * p1 + i02 * p2
-            g01 = i00 * p1 + i01 * p3 + i02 * p4
-            g02 = i00 * p2 + i01 * p4 + i02 * p5
-            g10 = i01 * p0 + i11 * p1 + i12 * p2
-            g11 = i01 * p1 + i11 * p3 + i12 * p4
-            g12 = i01 * p2 + i11 * p4 + i12 * p5
-            g20 = i02 * p0 + i12 * p1 + i22 * p2
-            g21 = i02 * p1 + i12 * p3 + i22 * p4
-            g22 = i02 * p2 + i12 * p4 + i22 * p5
+            # rows of A^-1 T, then A^-1 T A^-1
+            g00 = i00 * t0 + i01 * t1 + i02 * t2
+            g01 = i00 * t1 + i01 * t3 + i02 * t4
+            g02 = i00 * t2 + i01 * t4 + i02 * t5
+            g10 = i01 * t0 + i11 * t1 + i12 * t2
+            g11 = i01 * t1 + i11 * t3 + i12 * t4
+            g12 = i01 * t2 + i11 * t4 + i12 * t5
+            g20 = i02 * t0 + i12 * t1 + i22 * t2
+            g21 = i02 * t1 + i12 * t3 + i22 * t4
+            g22 = i02 * t2 + i12 * t4 + i22 * t5
             o[3] = g00 * i00 + g01 * i01 + g02 * i02
             o[4] = g00 * i01 + g01 * i11 + g02 * i12
             o[5] = g00 * i02 + g01 * i12 + g02 * i22
@@ -154,7 +160,7 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
             o[10] = n_effective
             o[11] = max(zz - o[0] * z0 - o[1] * z1 - o[2] * z2, 0.0)
             trace = g00 + g11 + g22
-            o[12] = max(count - trace, 0.0)
+            o[12] = max(expected - trace, 0.0)
             o[13] = math.sqrt(s1 * s1 + s2 * s2) / s0
             o[14] = time / s0
             o[15] = s0 / count
@@ -181,14 +187,14 @@ def _information(o):
 @njit(cache=True, error_model="numpy")
 def shrink_planes(fits, base, detail, kernel, n_minimum, shrinkage, planes):
     """
-    Planes of one level: the coarser level's plane plus the shrunk plane of what it left over.
+    Planes of one level: what the coarser levels left over, shrunk.
 
     Parameters
     ----------
     fits : array, shape (n_i, n_j, N_FIT)
         Local planes of the residuals.
-    base : array, shape (5, n_i, n_j)
-        Coarser surface at the centres: value, slope east, slope north, variance, defined (1 or 0).
+    base : array, shape (2, n_i, n_j)
+        Variance of the coarser levels' sum at the centres, and whether it is defined (1 or 0).
     detail : array, shape (n_i, n_j), m2
         Typical variance of what this level adds around there; enters the variance where the data of a field cannot
         tell.
@@ -216,8 +222,8 @@ def shrink_planes(fits, base, detail, kernel, n_minimum, shrinkage, planes):
     for i in range(n_i):
         for j in range(n_j):
             o = fits[i, j]
-            is_based = base[4, i, j] > 0.0
-            v = base[3, i, j] if is_based else 0.0
+            is_based = base[1, i, j] > 0.0
+            v = base[0, i, j] if is_based else 0.0
             s = 0.0
             added = detail[i, j]
             if information[i, j] >= 0.0:
@@ -240,9 +246,9 @@ def shrink_planes(fits, base, detail, kernel, n_minimum, shrinkage, planes):
             if not is_based and s == 0.0:
                 planes[4, i, j] = 0.0
                 continue
-            planes[0, i, j] = (base[0, i, j] if is_based else 0.0) + s * o[0]
-            planes[1, i, j] = (base[1, i, j] if is_based else 0.0) + s * o[1] / kernel
-            planes[2, i, j] = (base[2, i, j] if is_based else 0.0) + s * o[2] / kernel
+            planes[0, i, j] = s * o[0]
+            planes[1, i, j] = s * o[1] / kernel
+            planes[2, i, j] = s * o[2] / kernel
             planes[3, i, j] = (1.0 - s) * v + s * o[3] + added
             gamma = detail[i, j] + 1e-8
             if information[i, j] >= 0.0:
@@ -415,7 +421,7 @@ def survey_support(window, cell_size, row0, column0, kernel, spacing, first_row,
                     s2 += w * dv
                     p0 += w * w / n
                     time += w * m[11] / m[1]
-                    variance += w * n / m[1]
+                    variance += w * m[12] / n
             o = support[i, j]
             o[0] = o[1] = o[2] = o[3] = 0.0
             if s0 > 0.0:

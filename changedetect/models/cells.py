@@ -59,16 +59,42 @@ class Cells:
             float(self.row.max() + 1) * c,
         )
 
-    def with_plane_removed(self, surface: FloatArray) -> Self:
-        """Moments of what is left over a surface; `surface` has shape (m, >= 3): value, slope east, slope north."""
-        columns = (np.ascontiguousarray(surface[:, k]) for k in range(3))
-        return replace(self, moments=kernel.shift_moments(self.moments, *columns))
+    @property
+    def places(self) -> Coordinates:
+        """Easting and northing of the mean position of each cell's observations, m."""
+        easting, northing = self.centres
+        return easting + self.moments[:, 2] / self.moments[:, 1], northing + self.moments[:, 3] / self.moments[:, 1]
+
+    def with_surface_removed(self, surface: FloatArray) -> Self:
+        """
+        Moments of what is left over a surface.
+
+        Parameters
+        ----------
+        surface : array, shape (m, >= 3)
+            Value, slope east and slope north at `places`: within a cell the surface counts as its tangent there,
+            which is exact for a single observation.
+
+        Returns
+        -------
+        cells : Cells
+        """
+        east, north = np.ascontiguousarray(surface[:, 1]), np.ascontiguousarray(surface[:, 2])
+        mean = self.moments[:, 2:4] / self.moments[:, 1:2]
+        at_centre = surface[:, 0] - east * mean[:, 0] - north * mean[:, 1]
+        return replace(self, moments=kernel.shift_moments(self.moments, at_centre, east, north))
 
     def with_weights_scaled(self, factor: FloatArray | float) -> Self:
-        """Weights, and all they enter, times a factor per cell; counts stay."""
+        """Weights, and all they enter, times a factor per cell; counts and noise variances stay."""
         scaled = self.moments * np.reshape(factor, (-1, 1))
-        scaled[:, 0] = self.moments[:, 0]
+        scaled[:, (0, 12)] = self.moments[:, (0, 12)]
         return replace(self, moments=scaled)
+
+    def with_noise(self, variance: FloatArray) -> Self:
+        """State the noise variance of an observation, m2, cell by cell; shape (m,)."""
+        moments = self.moments.copy()
+        moments[:, 12] = moments[:, 0] * variance
+        return replace(self, moments=moments)
 
     def coarsened(self) -> Cells:
         """Moments over cells of twice the size."""

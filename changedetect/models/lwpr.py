@@ -31,6 +31,8 @@ __all__ = ["LWPRSurface", "check_observations", "point_density"]
 _FINEST_KERNEL = 1.16
 #: Levels of the pyramid where no coarsest kernel is set: ten, a factor of 22 in kernel size.
 _N_STEPS = 9
+#: Shrinkage of what a new epoch changes in the memory; stronger than the surface's, since most ground stays.
+_CHANGE_SHRINKAGE = 2.0
 #: Spacing, in kernels, of the places where the noise is estimated: neighbours share little data.
 _NOISE_SPACING = 1.6
 #: Kernel, in finest kernels, within which observations must surround a place for an answer there.
@@ -204,9 +206,9 @@ class LWPRSurface:
             raise ValueError(msg)
         if present is None or time > present:
             parent = None if present is None else self.copy()
-            self.own_kernel_ = self._finest_kernel(easting, northing)
-            cell_size = self.settings.cell_size_m or self.own_kernel_
-            self.evidence_ = Evidence(2.0 ** math.floor(math.log2(cell_size) + 1e-9), is_weighted=s is not None)
+            spacing = 1.0 / math.sqrt(point_density(easting, northing))
+            self.own_kernel_ = self._finest_kernel(spacing)
+            self.evidence_ = Evidence(self._cell_size(spacing), is_weighted=s is not None)
             self.survey_time_ = time
             self._inherit(parent)
         if self.evidence_.is_weighted != (s is not None):
@@ -310,11 +312,18 @@ class LWPRSurface:
         return read_state(directory, cls)
 
     def own_cells(self) -> Cells:
-        """Cells of the present epoch, weighted by one over the noise variance found around them."""
+        """
+        Cells of the present epoch with the noise variance found around them.
+
+        Weights are scaled, all by one factor, to one over the typical noise variance. They do not follow the noise
+        from place to place: where quiet and noisy ground meet, weighted planes would follow the quiet side only.
+        """
         cells = self.evidence_.cells(self.survey_time_)
         kernel = self.own_kernel_
         noise = noise_variance(CellPyramid(cells).for_kernel(kernel), kernel, _NOISE_SPACING * kernel)
-        return cells.with_weights_scaled(1.0 / noise.blend(*cells.centres)[:, 0])
+        factor = noise.blend(*cells.centres)[:, 0]
+        observed = factor * cells.moments[:, 0] / cells.moments[:, 1]
+        return cells.with_noise(observed).with_weights_scaled(1.0 / float(np.median(factor)))
 
     def _inherit(self, parent: Self | None) -> None:
         """Take over the memory and the kernel bank of the epoch before."""
@@ -329,16 +338,27 @@ class LWPRSurface:
         coarsest = self.settings.kernel_max_m or self.memory_kernel_ * math.sqrt(2.0) ** _N_STEPS
         self.kernels_ = tuple(scale_bank(finest, max(finest, coarsest), self.settings.kernel_ratio))
 
-    def _finest_kernel(self, easting: FloatArray, northing: FloatArray) -> float:
-        """Finest kernel that the density of an epoch supports, in half octaves of a metre, unless it is set."""
+    def _finest_kernel(self, spacing: float) -> float:
+        """Finest kernel for a mean spacing of observations, in half octaves of a metre, unless it is set."""
         if self.settings.kernel_min_m is not None:
             return self.settings.kernel_min_m
-        wanted = max(_FINEST_KERNEL / math.sqrt(point_density(easting, northing)), self.resolution or 0.0)
+        wanted = max(_FINEST_KERNEL * spacing, self.resolution or 0.0)
         return 2.0 ** (round(2.0 * math.log2(wanted)) / 2.0)
 
-    def _refine(self, cells: Cells, region: Region) -> Level:
-        s = self.settings
-        return refine(cells, region, list(self.kernels_), s.lattice_spacing, s.shrinkage)
+    def _cell_size(self, spacing: float) -> float:
+        """
+        Edge of the micro-cells, a power of two of a metre.
+
+        Half the finest kernel; the whole of it where it is wide for the density, because then a cell of that size
+        holds six observations or more and the plane inside it is known.
+        """
+        kernel = self.own_kernel_
+        is_dense = kernel >= 2.0 * _FINEST_KERNEL * spacing
+        wanted = self.settings.cell_size_m or (kernel if is_dense else 0.5 * kernel)
+        return 2.0 ** math.floor(math.log2(wanted) + 1e-9)
+
+    def _refine(self, cells: Cells) -> Level:
+        return refine(cells, self.kernels_, self.settings.lattice_spacing, self.settings.shrinkage)
 
     def _moved_memory(self, own: Cells) -> Cells | None:
         """
@@ -351,19 +371,19 @@ class LWPRSurface:
         memory = self.memory_
         if memory is None or len(memory) == 0:
             return None
-        remembered = self._refine(memory, memory.region)
+        remembered = self._refine(memory)
         remembered.planes[6] = _support_at(memory, remembered, self.memory_kernel_)[0]
-        surface = remembered.blend(*own.centres)
+        surface = remembered.blend(*own.places)
         known = surface[:, 5] >= 0.5
         if not known.any():
             return memory
         both = Cells(own.cell_size, own.row[known], own.column[known], own.moments[known])
-        left_over = both.with_plane_removed(surface[known])
-        change = self._refine(left_over, left_over.region)
+        left_over = both.with_surface_removed(surface[known])
+        change = refine(left_over, self.kernels_, self.settings.lattice_spacing, _CHANGE_SHRINKAGE)
         change.planes[6] = _support_at(left_over, change, self.own_kernel_)[0]
-        moved = change.blend(*memory.centres)
+        moved = change.blend(*memory.places)
         moved[moved[:, 5] < 0.5, :3] = 0.0
-        return memory.with_plane_removed(-moved)
+        return memory.with_surface_removed(-moved)
 
     def _receptive_fields(self) -> _Built:
         built = self.__dict__.get("_built")
@@ -376,7 +396,7 @@ class LWPRSurface:
         own = self.own_cells()
         memory = self._moved_memory(own)
         cells = own if memory is None else merge_cells([memory, own])
-        level = self._refine(cells, cells.region)
+        level = self._refine(cells)
         supported, _, noise = _support_at(own, level, self.own_kernel_)
         own_support = Level(level.lattice, level.planes.copy())
         own_support.planes[6] = supported

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from changedetect.kernels.moments import N_MOMENTS
 from changedetect.kernels.receptive_fields import (
     N_FIT,
     N_PLANE,
@@ -28,8 +27,10 @@ if TYPE_CHECKING:
 
 __all__ = ["CellPyramid", "Lattice", "Level", "build_level", "noise_variance", "refine", "scale_bank"]
 
-#: Radius of the blending kernel in lattice spacings; 1.5 had the least error of 1.2, 1.5 and 2.0.
-BLENDING_REACH = 1.5
+#: Radius of the blending kernel in lattice spacings. While levels add up, wide: weights w / Gamma then let the fields
+#: win that lie on one side of an edge. For the finished surface narrow: one field for one place.
+_LEVEL_REACH = 2.0
+_SURFACE_REACH = 1.5
 #: Effective number of observations below which a plane is not fitted.
 N_MINIMUM = 4.0
 #: A field whose observations' centroid lies further from its centre than this many kernels extrapolates.
@@ -88,10 +89,20 @@ class Lattice:
 
 @dataclass(frozen=True)
 class Level:
-    """Receptive fields of one level; `planes` has shape (N_PLANE, n_rows, n_columns)."""
+    """
+    Receptive fields of one level and how far each is blended.
+
+    Attributes
+    ----------
+    lattice : Lattice
+    planes : array, shape (N_PLANE, n_rows, n_columns)
+    reach : float
+        Radius of the blending kernel, lattice spacings.
+    """
 
     lattice: Lattice
     planes: FloatArray
+    reach: float = _SURFACE_REACH
 
     def blend(self, easting: FloatArray, northing: FloatArray) -> FloatArray:
         """Evaluate at places of shape (n,): array (n, 8), see `blend_planes`."""
@@ -99,7 +110,7 @@ class Level:
         lattice = self.lattice
         blend_planes(
             np.ascontiguousarray(easting), np.ascontiguousarray(northing), self.planes, lattice.spacing,
-            lattice.first_row, lattice.first_column, BLENDING_REACH, blended,
+            lattice.first_row, lattice.first_column, self.reach, blended,
         )  # fmt: skip
         return blended
 
@@ -205,10 +216,10 @@ def noise_variance(cells: Cells, kernel: float, spacing: float) -> Level:
 
 def _detail_variance(fits: FloatArray, base: FloatArray) -> FloatArray:
     """Typical variance of what a level adds to the coarser surface, averaged over a neighbourhood; m2."""
-    usable = (fits[..., 9] > 0.0) & (fits[..., 10] >= N_MINIMUM) & (base[4] > 0.0)
+    usable = (fits[..., 9] > 0.0) & (fits[..., 10] >= N_MINIMUM) & (base[1] > 0.0)
     if not usable.any():
         return np.zeros(usable.shape)
-    excess = np.where(usable, fits[..., 0] ** 2 - np.maximum(fits[..., 3] - base[3], 0.0), 0.0)
+    excess = np.where(usable, fits[..., 0] ** 2 - np.maximum(fits[..., 3] - base[0], 0.0), 0.0)
     weight = usable.astype(np.float64)
     overall = excess.sum() / weight.sum()
     smooth = gaussian_filter(excess, _DETAIL_REACH, truncate=3.0, mode="constant")
@@ -217,17 +228,16 @@ def _detail_variance(fits: FloatArray, base: FloatArray) -> FloatArray:
     return local
 
 
-def build_level(cells: Cells, region: Region, kernel: float, spacing: float, shrinkage: float, coarser: Level | None) -> Level:
+def build_level(cells: Cells, lattice: Lattice, shrinkage: float, coarser: Level | None) -> Level:
     """
-    Receptive fields of one kernel size on top of a coarser level.
+    Receptive fields of one kernel size on what the coarser levels left over.
 
     Parameters
     ----------
     cells : Cells
-        Moments with weights 1 / variance, of a size that suits the kernel.
-    region : (west, east, south, north), m
-        Ground to cover.
-    kernel, spacing : float, m
+        Moments of the residuals, of a size that suits the kernel.
+    lattice : Lattice
+        Fields to fit.
     shrinkage : float
     coarser : Level or None
         None makes this the base: planes are taken as fitted.
@@ -235,33 +245,28 @@ def build_level(cells: Cells, region: Region, kernel: float, spacing: float, shr
     Returns
     -------
     level : Level
+        Values are this level's share, the variance is that of the sum of all levels so far.
     """
-    lattice = Lattice.covering(region, kernel, spacing)
-    base = np.zeros((5, *lattice.shape))
-    left_over = cells
+    base = np.zeros((2, *lattice.shape))
     if coarser is not None:
-        left_over = cells.with_plane_removed(coarser.blend(*cells.centres))
         at_centres = coarser.blend(*lattice.centres())
-        for k, column in enumerate((0, 1, 2, 3, 7)):
-            base[k] = at_centres[:, column].reshape(lattice.shape)
-    fits = fit_lattice(left_over, lattice)
+        base[0] = at_centres[:, 3].reshape(lattice.shape)
+        base[1] = at_centres[:, 7].reshape(lattice.shape)
+    fits = fit_lattice(cells, lattice)
     planes = np.zeros((N_PLANE, *lattice.shape))
-    shrink_planes(fits, base, _detail_variance(fits, base), kernel, N_MINIMUM, shrinkage, planes)
-    return Level(lattice, planes)
+    shrink_planes(fits, base, _detail_variance(fits, base), lattice.kernel, N_MINIMUM, shrinkage, planes)
+    return Level(lattice, planes, _LEVEL_REACH)
 
 
-def refine(
-    cells: Cells, region: Region, kernels: list[float], lattice_spacing: float, shrinkage: float
-) -> Level:
+def refine(cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shrinkage: float) -> Level:
     """
-    The finest level of a pyramid, its planes holding the sum of all levels.
+    A pyramid of receptive fields, summed into the fields of its finest level.
 
     Parameters
     ----------
     cells : Cells
-        Finest moments, weights 1 / variance.
-    region : (west, east, south, north), m
-    kernels : list of float, m
+        Finest moments.
+    kernels : tuple of float, m
         Coarse to fine.
     lattice_spacing : float
         In kernels.
@@ -270,18 +275,30 @@ def refine(
     Returns
     -------
     level : Level
+        Each field holds value, slope and variance of the sum of all levels at its centre, so that a prediction costs
+        the same however many levels there are.
     """
-    if len(cells) == 0 or cells.moments.shape[1] != N_MOMENTS:
+    if len(cells) == 0:
         msg = "a pyramid needs at least one occupied cell"
         raise ValueError(msg)
-    sizes = CellPyramid(cells)
-    level: Level | None = None
+    region = cells.region
+    levels: list[Level] = []
     for kernel in kernels:
-        level = build_level(sizes.for_kernel(kernel), region, kernel, lattice_spacing * kernel, shrinkage, level)
-    if level is None:
-        msg = "a pyramid needs at least one kernel size"
-        raise ValueError(msg)
-    return level
+        lattice = Lattice.covering(region, kernel, lattice_spacing * kernel)
+        levels.append(
+            build_level(CellPyramid(cells).for_kernel(kernel), lattice, shrinkage, levels[-1] if levels else None)
+        )
+        if kernel != kernels[-1]:
+            cells = cells.with_surface_removed(levels[-1].blend(*cells.places))
+    finest = levels[-1]
+    places = finest.lattice.centres()
+    total = np.zeros((places[0].size, 3))
+    for level in levels:
+        total += level.blend(*places)[:, :3]
+    planes = finest.planes.copy()
+    planes[:3] = total.T.reshape(3, *finest.lattice.shape)
+    planes[4] = planes[4] > 0.0
+    return Level(finest.lattice, planes)
 
 
 def support(cells: Cells, lattice: Lattice, kernel: float) -> FloatArray:

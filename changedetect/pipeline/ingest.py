@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
-from changedetect.catalogue import Epoch, Programme, Source, StateRecord, validate_epoch_id
-from changedetect.errors import InputDataError, MissingInputError, ModelStateError, OutputExistsError
+from changedetect.catalogue import Epoch, Programme, Source, validate_epoch_id
+from changedetect.errors import InputDataError, MissingInputError, OutputExistsError
 from changedetect.pipeline.lock import programme_lock
 from changedetect.pipeline.reading import read_epoch_points
 from changedetect.pipeline.regions import describe_region, regions_overlap
@@ -153,7 +153,7 @@ def _known_checksums(programme: Programme, epoch: Epoch) -> list[str]:
     """Checksums pinned in the epoch's file, or else those found when it was learned, or else those on disk."""
     if all(source.sha256 for source in epoch.sources):
         return [source.sha256 for source in epoch.sources if source.sha256]
-    record = _intact_record(programme, epoch)
+    record = programme.intact_state_record(epoch.epoch_id)
     if record is not None:
         return [source.sha256 for source in record.sources]
     checksums = []
@@ -185,17 +185,8 @@ def _require_overlap(programme: Programme, epoch_id: str, region: Region) -> Non
 def _known_region(programme: Programme, epoch: Epoch) -> Region | None:
     if epoch.region is not None:
         return epoch.region
-    record = _intact_record(programme, epoch)
+    record = programme.intact_state_record(epoch.epoch_id)
     return None if record is None else record.region
-
-
-def _intact_record(programme: Programme, epoch: Epoch) -> StateRecord | None:
-    try:
-        found = programme.state_record(epoch.epoch_id)
-    except ModelStateError as error:
-        logger.warning("%s", error)
-        return None
-    return None if found is None else found[0]
 
 
 def _copied(programme: Programme, epoch: Epoch) -> Epoch:

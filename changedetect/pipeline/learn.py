@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import changedetect
-from changedetect.catalogue import Epoch, Programme, SourceRecord, StateRecord, checksums, own_state_reasons
+from changedetect.catalogue import Epoch, Programme, SourceRecord, StateRecord, describe_files, own_state_reasons
 from changedetect.errors import ModelStateError
 from changedetect.models.lwpr import LWPRSurface
 from changedetect.models.reference import ReferenceLWPR
@@ -152,7 +152,7 @@ def _write_state(programme: Programme, epoch: Epoch, parent: Epoch | None, learn
             sources=learned.sources,
             n_points=learned.n_points,
             region=learned.model.region,
-            files=checksums(temporary),
+            files=describe_files(temporary),
             software_version=changedetect.__version__,
             created=utc_now(),
         ).write(temporary)

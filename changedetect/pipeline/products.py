@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import changedetect
-from changedetect.catalogue import ChangeProduct, ProductRecord, Programme, checksums
+from changedetect.catalogue import ChangeProduct, ProductRecord, Programme, describe_files
 from changedetect.config import ProgrammeConfig
 from changedetect.differencing import difference_models, summarise
 from changedetect.errors import ModelStateError
@@ -226,7 +226,7 @@ def _manifest_writer(
             region=grid.region,
             colour_limits=limits,
             warnings=warnings,
-            files=checksums(folder),
+            files=describe_files(folder),
             software_version=changedetect.__version__,
             run_id=run_id,
             created=utc_now(),

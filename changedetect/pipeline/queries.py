@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
-from itertools import islice
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
@@ -18,17 +18,15 @@ from changedetect.io.cog import write_cog
 from changedetect.io.netcdf import SURFACE_LAYERS, SurfaceMetadata, write_surface
 from changedetect.pipeline.learn import ModelShelf
 from changedetect.pipeline.manifest import new_run_id, utc_now
+from changedetect.pipeline.places import iter_coordinates
 from changedetect.pipeline.products import make_pair_products, predict_layers, product_grid
 from changedetect.storage import atomic_path
-from changedetect.typing import Coordinates, FloatArray, JSONObject, Region
+from changedetect.typing import JSONObject, Region
 
 __all__ = ["difference_epochs", "predict_table", "require_model", "write_epoch_surface"]
 
 #: Columns that `predict_table` writes after easting and northing.
 PREDICTED_COLUMNS = ("elevation", "elevation_std", "noise_std", "n_effective")
-_EASTING_NAMES = ("easting", "easting_m", "east", "e", "x")
-_NORTHING_NAMES = ("northing", "northing_m", "north", "n", "y")
-_ROWS_AT_A_TIME = 200_000
 
 
 def require_model(programme: Programme, epoch_id: str) -> str | None:
@@ -54,7 +52,7 @@ def require_model(programme: Programme, epoch_id: str) -> str | None:
 
 
 def predict_table(
-    programme: Programme, epoch_id: str, points: Path, output: Path, *, overwrite: bool = False
+    programme: Programme, epoch_id: str, points: Path, output: Path, *, overwrite: bool = False, dry_run: bool = False
 ) -> JSONObject:
     """
     Predict the surface of an epoch at the places of a table.
@@ -70,6 +68,8 @@ def predict_table(
         CSV file with easting, northing, elevation, elevation_std, noise_std (m) and n_effective; "nan" where no data
         supports an answer. Numbers are written so that they read back bit for bit.
     overwrite : bool
+    dry_run : bool
+        Read and predict, and write nothing.
 
     Returns
     -------
@@ -85,14 +85,13 @@ def predict_table(
     """
     require_absent(output, overwrite=overwrite)
     model = ModelShelf(programme).get(epoch_id)
+    header = ("easting", "northing", *PREDICTED_COLUMNS)
     n_points = n_unknown = 0
-    with _open_table(points) as stream, atomic_path(output) as temporary, temporary.open("w", newline="") as target:
-        writer = csv.writer(target, lineterminator="\n")
-        writer.writerow(("easting", "northing", *PREDICTED_COLUMNS))
-        for easting, northing in _coordinate_blocks(stream, points):
+    with iter_coordinates(points) as blocks, _new_table(output, header, dry_run=dry_run) as write_rows:
+        for easting, northing in blocks:
             prediction = model.predict((easting, northing))
             columns = [easting, northing, *(getattr(prediction, name) for name in PREDICTED_COLUMNS)]
-            writer.writerows(zip(*(map(repr, column.tolist()) for column in columns), strict=True))
+            write_rows(zip(*(map(repr, column.tolist()) for column in columns), strict=True))
             n_points += easting.size
             n_unknown += int(np.count_nonzero(np.isnan(prediction.elevation)))
         if n_points == 0:
@@ -110,6 +109,7 @@ def write_epoch_surface(
     resolution: float | None = None,
     bounds: Region | None = None,
     overwrite: bool = False,
+    dry_run: bool = False,
 ) -> JSONObject:
     """
     Write the surface of an epoch as one raster.
@@ -125,7 +125,7 @@ def write_epoch_surface(
     resolution : float, m, optional
     bounds : tuple (west, east, south, north), m, optional
         The programme's own by default.
-    overwrite : bool
+    overwrite, dry_run : bool
 
     Returns
     -------
@@ -145,6 +145,9 @@ def write_epoch_surface(
     config, epoch = programme.config, programme.epoch(epoch_id)
     model = ModelShelf(programme).get(epoch_id)
     grid = product_grid(config, model.region, resolution=resolution, bounds=bounds)
+    details: JSONObject = {"output": str(output), "shape": list(grid.shape), "region": list(grid.region)}
+    if dry_run:
+        return details
     layers = predict_layers(model, grid)
     meta = SurfaceMetadata(
         programme=config.name,
@@ -167,12 +170,11 @@ def write_epoch_surface(
             unit=described.unit,
             tags={key: str(value) for key, value in asdict(meta).items() if value} | {"layer": layer},
         )
-    known = float(np.mean(np.isfinite(layers["elevation"])))
-    return {"output": str(output), "shape": list(grid.shape), "region": list(grid.region), "covered_share": known}
+    return details | {"covered_share": float(np.mean(np.isfinite(layers["elevation"])))}
 
 
 def difference_epochs(
-    programme: Programme, earlier: str, later: str, directory: Path, *, overwrite: bool = False
+    programme: Programme, earlier: str, later: str, directory: Path, *, overwrite: bool = False, dry_run: bool = False
 ) -> JSONObject:
     """
     Write the products of one pair of epochs into any folder.
@@ -184,7 +186,7 @@ def difference_epochs(
         Epoch ids, in the order of time.
     directory : Path
         Replaced as a whole where it holds such products already and `overwrite` is set.
-    overwrite : bool
+    overwrite, dry_run : bool
 
     Returns
     -------
@@ -198,6 +200,8 @@ def difference_epochs(
     """
     require_replaceable(directory, overwrite=overwrite)
     pair = programme.pair(earlier, later)
+    if dry_run:
+        return {"directory": str(directory)}
     return make_pair_products(programme, pair, ModelShelf(programme), new_run_id(), directory)
 
 
@@ -235,69 +239,19 @@ def require_replaceable(directory: Path, *, overwrite: bool) -> None:
         raise OutputExistsError(msg)
 
 
-def _coordinate_blocks(stream: TextIO, path: Path) -> Iterator[Coordinates]:
-    """Yield easting and northing of some rows at a time."""
-    rows = enumerate(csv.reader(stream), start=1)
-    try:
-        first = next(((line, row) for line, row in rows if row), None)
-        if first is None:
-            return
-        columns = _columns(first[1], path)
-        head = [first] if columns is None else []
-        easting, northing = (0, 1) if columns is None else columns
-        while True:
-            block = [*head, *((line, row) for line, row in islice(rows, _ROWS_AT_A_TIME) if row)]
-            head = []
-            if not block:
-                return
-            yield _numbers(block, easting, path), _numbers(block, northing, path)
-    except UnicodeDecodeError as error:
-        msg = f"'{path}' is not a table of text: byte {error.start} is not UTF-8."
-        raise InputDataError(msg) from error
+@contextmanager
+def _new_table(
+    output: Path, header: Sequence[str], *, dry_run: bool
+) -> Iterator[Callable[[Iterable[Sequence[str]]], None]]:
+    """Give what writes rows of a CSV file that is whole or absent; it takes them and writes nothing on a dry run."""
+    if dry_run:
+        yield _exhaust
+        return
+    with atomic_path(output) as temporary, temporary.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(header)
+        yield writer.writerows
 
 
-def _columns(header: Sequence[str], path: Path) -> tuple[int, int] | None:
-    """Return where easting and northing stand; None for a first row of numbers."""
-    names = [name.strip().lower().lstrip("\ufeff") for name in header]
-    if names[:2] and all(_is_number(name) for name in names[:2]):
-        if len(names) < 2:
-            msg = f"'{path}', line 1: easting and northing are needed, separated by a comma; got {header!r}."
-            raise InputDataError(msg)
-        return None
-    found = []
-    for wanted in (_EASTING_NAMES, _NORTHING_NAMES):
-        index = next((names.index(name) for name in wanted if name in names), None)
-        if index is None:
-            msg = (
-                f"'{path}' has no column '{wanted[0]}' (or {', '.join(wanted[1:])}); its header says "
-                f"{', '.join(header)}. Columns are separated by commas."
-            )
-            raise InputDataError(msg)
-        found.append(index)
-    return found[0], found[1]
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _numbers(block: Sequence[tuple[int, Sequence[str]]], column: int, path: Path) -> FloatArray:
-    values = np.empty(len(block))
-    for index, (line, row) in enumerate(block):
-        text = row[column] if column < len(row) else ""
-        if not _is_number(text) or not math.isfinite(float(text)):
-            msg = f"'{path}', line {line}: {text!r} is no finite coordinate in metres."
-            raise InputDataError(msg)
-        values[index] = float(text)
-    return values
-
-
-def _open_table(path: Path) -> TextIO:
-    if not path.is_file():
-        msg = f"No such file: {path}. Check the name and the folder."
-        raise MissingInputError(msg)
-    return path.open(encoding="utf-8", newline="")
+def _exhaust(rows: Iterable[Sequence[str]]) -> None:
+    deque(rows, maxlen=0)

@@ -64,7 +64,6 @@ class UpdateResult:
 
 def update(
     programme: Programme,
-    rule: str | None = None,
     *,
     command: str = "update",
     on_progress: Progress | None = None,
@@ -75,8 +74,6 @@ def update(
     Parameters
     ----------
     programme : Programme
-    rule : {"consecutive", "first", "all"}, optional
-        Which epochs to difference; the programme's own rule by default.
     command : str
         For the run's manifest.
     on_progress : callable, optional
@@ -94,17 +91,17 @@ def update(
     OutputError
         The programme's folder cannot be written.
     """
-    items = plan(programme, rule)
+    items = plan(programme)
     if not any(item.is_due for item in items):
         return UpdateResult(items=items)
     _use_workers(programme.config.machine.workers)
     with programme_lock(programme.directory):
-        items = plan(programme, rule)  # another run may have finished in between
+        items = plan(programme)  # another run may have finished in between
         if not any(item.is_due for item in items):
             return UpdateResult(items=items)
         run = RunManifest(programme, command)
         with run.recording():
-            _Update(programme, rule, run, on_progress, sum(item.is_due for item in items)).execute()
+            _Update(programme, run, on_progress, sum(item.is_due for item in items)).execute()
     return UpdateResult(
         items=items,
         run_id=run.run_id,
@@ -117,11 +114,8 @@ def update(
 class _Update:
     """The steps of one update; every decision is taken anew from what the steps before really achieved."""
 
-    def __init__(
-        self, programme: Programme, rule: str | None, run: RunManifest, on_progress: Progress | None, total: int
-    ) -> None:
+    def __init__(self, programme: Programme, run: RunManifest, on_progress: Progress | None, total: int) -> None:
         self.programme = programme
-        self.rule = rule
         self.run = run
         self.models = ModelShelf(programme)
         self._on_progress = on_progress
@@ -136,7 +130,7 @@ class _Update:
             if reasons := epoch_product_reasons(programme, epoch_id, self._states):
                 with self._step(Item("epoch", epoch_id, reasons)) as details:
                     details.update(make_epoch_products(programme, epoch_id, self.models, run_id))
-        for pair in wanted_pairs(programme, self.rule, list(self._states)):
+        for pair in wanted_pairs(programme, list(self._states)):
             if reasons := pair_reasons(programme, pair, self._states):
                 with self._step(Item("pair", pair.product_id, reasons)) as details:
                     details.update(make_pair_products(programme, pair, self.models, run_id))

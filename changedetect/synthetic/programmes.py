@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from datetime import date
 from typing import TYPE_CHECKING, Literal, TypeAlias
@@ -150,7 +151,7 @@ def simulate_programme(scene: Scene, plans: Sequence[EpochPlan], *, random_seed:
         msg = f"A scene of {scene.n_stages} stages needs as many epochs; got {len(plans)} plans."
         raise ValueError(msg)
     dates = [plan.date for plan in plans]
-    if any(later <= earlier for earlier, later in zip(dates, dates[1:], strict=False)):
+    if any(later <= earlier for earlier, later in itertools.pairwise(dates)):
         msg = f"The dates of the epochs must ascend; got {', '.join(day.isoformat() for day in dates)}."
         raise ValueError(msg)
     epochs = tuple(
@@ -255,9 +256,7 @@ def benchmark_dems(
         msg = f"Unknown case {case!r} of the raster benchmark; use 'independent', 'correlated' or 'heteroscedastic'."
         raise ValueError(msg)
     side = size * resolution
-    scene = dem_scene(
-        [random_seed, 0], side=side, relief_std=side / 40.0, is_noise_steeper=case == "heteroscedastic"
-    )
+    scene = dem_scene([random_seed, 0], side=side, relief_std=side / 40.0, is_noise_steeper=case == "heteroscedastic")
     grid = Grid.from_region(scene.region, resolution, scene.crs)
     if case == "independent":
         errors = (SurveyErrors(), SurveyErrors())

@@ -265,9 +265,7 @@ def coast_scene(random_seed: Seed, *, side: float = 120.0, corner: tuple[float, 
     west, south = corner
     cliff = Scarp((west + 0.35 * side, south), azimuth_deg=rng.uniform(-5.0, 5.0), height=4.0, width=1.5)
     retreated = cliff.retreated(3.0)
-    dunes = DuneCrests(
-        (west + 0.6 * side, south), rng.uniform(10.0, 30.0), wavelength=18.0, height=1.2, wander=2.0
-    )
+    dunes = DuneCrests((west + 0.6 * side, south), rng.uniform(10.0, 30.0), wavelength=18.0, height=1.2, wander=2.0)
     channel = Channel(
         (west + 0.15 * side, south), rng.uniform(-4.0, 4.0), depth=0.8, half_width=2.0, bank_width=3.0,
         meander_amplitude=3.0, meander_wavelength=0.5 * side,

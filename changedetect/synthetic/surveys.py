@@ -183,9 +183,7 @@ def survey_points(scene: Scene, design: SurveyDesign, random_seed: Seed, *, stag
         elevation=elevation + errors.shift[2],
         sigma=white_std if design.is_sigma_reported else None,
     )
-    return Survey(
-        cloud=cloud, scene=scene, stage=stage, design=design, correlated_error=fields, is_outlier=is_outlier
-    )
+    return Survey(cloud=cloud, scene=scene, stage=stage, design=design, correlated_error=fields, is_outlier=is_outlier)
 
 
 def survey_dem(

@@ -29,10 +29,8 @@ def epoch(density, seed, change=None, noise=0.05, keep=None):
 
 def difference(earlier, later):
     n = int(SIDE / RESOLUTION)
-    kernel = max(earlier.own_kernel_, later.own_kernel_)
-    return estimate_difference(
-        earlier.own_cells(), later.own_cells(), kernel, Lattice(0.0, RESOLUTION, 0, 0, n, n)
-    )
+    kernels = (earlier.own_kernel_, later.own_kernel_)
+    return estimate_difference(earlier.own_cells(), later.own_cells(), kernels, Lattice(0.0, RESOLUTION, 0, 0, n, n))
 
 
 def centres():
@@ -60,10 +58,14 @@ def test_unchanged_ground_is_flagged_at_the_nominal_rate(density):
 
 
 def test_epochs_of_very_different_density_are_still_calibrated():
-    result = difference(epoch(1.5, 31), epoch(60.0, 32))
-    both = result.observed[0] & result.observed[1]
-    both[:6], both[-6:], both[:, :6], both[:, -6:] = False, False, False, False
-    assert 0.02 < significant(result)[0][both].mean() < 0.08
+    flagged = []
+    for seed in range(4):
+        result = difference(epoch(1.5, 31 + seed), epoch(60.0, 41 + seed))
+        both = result.observed[0] & result.observed[1]
+        both[:6], both[-6:], both[:, :6], both[:, -6:] = False, False, False, False
+        flagged.append(significant(result)[0][both])
+    # a kernel of the thin epoch is 3 m wide: the four maps hold some 150 independent places
+    assert 0.02 < np.concatenate(flagged).mean() < 0.10
 
 
 @pytest.mark.parametrize("lift", [0.5, 0.1, -0.3])

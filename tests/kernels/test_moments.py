@@ -90,9 +90,9 @@ def test_a_plane_is_taken_off_exactly():
     easting, northing = rng.uniform(0.0, 4.0, (2, 500))
     elevation = 3.0 + 0.25 * easting - 0.5 * northing
     cells = _evidence(easting, northing, elevation).cells(0.0)
-    x, y = cells.centres
+    x, y = cells.places
     surface = np.column_stack([3.0 + 0.25 * x - 0.5 * y, np.full_like(x, 0.25), np.full_like(x, -0.5)])
-    residual = cells.with_plane_removed(surface).moments
+    residual = cells.with_surface_removed(surface).moments
     # what is left is the quantisation of the positions and elevations
     assert np.abs(residual[:, 7] / residual[:, 1]).max() < 2e-4
     assert (residual[:, 10] / residual[:, 1]).max() < 1e-7

@@ -109,8 +109,8 @@ def test_pure_noise_is_shrunk_to_the_coarser_surface():
     fits[..., 3] = fits[..., 6] = fits[..., 8] = 0.01
     fits[..., 9] = fits[..., 10] = fits[..., 12] = 20.0
     fits[..., 11], fits[..., 15] = 20.0, 100.0
-    base = np.zeros((5, 20, 20))
-    base[3], base[4] = 0.001, 1.0
+    base = np.zeros((2, 20, 20))
+    base[0], base[1] = 0.001, 1.0
     planes = np.zeros((kernel.N_PLANE, 20, 20))
     kernel.shrink_planes(fits, base, np.zeros((20, 20)), 1.0, 4.0, 1.0, planes)
     assert planes[8].mean() < 0.25

@@ -140,7 +140,7 @@ def test_the_past_sharpens_a_thin_survey_of_unchanged_ground():
     adapted = model.copy().partial_fit(second, later, survey_time=30.0).predict(at)
     known = np.isfinite(alone.elevation)
     rmse = [np.sqrt(np.mean((p.elevation - ground(*at))[known] ** 2)) for p in (alone, adapted)]
-    assert rmse[1] < 0.5 * rmse[0]
+    assert rmse[1] < 0.7 * rmse[0]
 
 
 def test_learning_epochs_again_from_their_evidence_gives_the_same_model():

@@ -6,7 +6,9 @@ import dataclasses
 import json
 import logging
 from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Self, TypeVar
 
@@ -15,56 +17,27 @@ import xarray as xr
 
 from changedetect.errors import ModelStateError
 from changedetect.models.base import Prediction
+from changedetect.models.comparators.observations import (
+    MIN_POINTS,
+    Observations,
+    check_positions,
+    check_time,
+    observations_from,
+    stack_observations,
+)
 from changedetect.storage import read_dataset, write_dataset
 
 if TYPE_CHECKING:
     from changedetect.typing import Coordinates, FloatArray
 
-__all__ = ["MIN_POINTS", "LocalAnswer", "Observations", "PointModel"]
+__all__ = ["LocalAnswer", "PointModel"]
 
 logger = logging.getLogger(__name__)
 
-#: Fewer observations than this teach none of the methods anything.
-MIN_POINTS = 10
 _FORMAT_VERSION = 1
 _FILE_NAME = "comparator.nc"
 
 Prepared = TypeVar("Prepared")
-
-
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """
-    The points of one epoch about a local origin, in an order that does not depend on how they came.
-
-    Attributes
-    ----------
-    easting, northing : array, shape (n,), m
-        Relative to `origin`.
-    elevation : array, shape (n,), m
-        Relative to `datum`.
-    variance : array, shape (n,), m2
-        Squares of the sigmas given; 0 where none was.
-    origin : (easting, northing), m
-        Whole metres near the middle: subtracting it from UTM coordinates is exact.
-    datum : float, m
-        Mean elevation.
-    """
-
-    easting: FloatArray
-    northing: FloatArray
-    elevation: FloatArray
-    variance: FloatArray
-    origin: tuple[float, float]
-    datum: float
-
-    @property
-    def positions(self) -> FloatArray:
-        """Easting and northing side by side, shape (n, 2), m."""
-        return np.column_stack([self.easting, self.northing])
-
-    def __len__(self) -> int:
-        return self.easting.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +74,7 @@ class PointModel(ABC, Generic[Prepared]):
     max_points: int | None = None
     parameters_: dict[str, float] = field(init=False, default_factory=dict, repr=False)
     _points: FloatArray = field(init=False, default_factory=lambda: np.empty((4, 0)), repr=False)
-    _survey_time: float | None = field(init=False, default=None, repr=False)
+    _survey_time: float = field(init=False, default=0.0, repr=False)
     _observations: Observations | None = field(init=False, default=None, repr=False)
     _prepared: Prepared | None = field(init=False, default=None, repr=False)
 
@@ -125,6 +98,7 @@ class PointModel(ABC, Generic[Prepared]):
         sigma : array, shape (n,), m, optional
             Standard deviation of each observation; noise beyond it is estimated.
         survey_time : float, days since 1970-01-01, optional
+            0 where none is given.
 
         Raises
         ------
@@ -132,8 +106,8 @@ class PointModel(ABC, Generic[Prepared]):
             Shapes differ, values are not finite, sigmas are not positive, there are fewer than 10 points or more than
             `max_points`.
         """
-        points = _stack(coordinates, elevation, sigma)
-        self._learn(points, _valid_time(survey_time))
+        points = stack_observations(coordinates, elevation, sigma)
+        self._learn(points, check_time(survey_time, default=0.0))
         return self
 
     def partial_fit(
@@ -149,16 +123,24 @@ class PointModel(ABC, Generic[Prepared]):
         Raises
         ------
         ValueError
-            As in `fit`; or `survey_time` lies before the present epoch's, or that has none.
+            As in `fit`; or `survey_time` lies before the present epoch's.
         """
-        points, time = _stack(coordinates, elevation, sigma), _valid_time(survey_time)
-        if self._points.shape[1] == 0:
-            self._learn(points, time)
-        elif self._is_new_epoch(time):
-            logger.info("%s begins a new epoch and drops %d points", type(self).__name__, self._points.shape[1])
+        points = stack_observations(coordinates, elevation, sigma)
+        if self._observations is None:
+            self._learn(points, check_time(survey_time, default=0.0))
+            return self
+        time = check_time(survey_time, default=self._survey_time)
+        if time < self._survey_time:
+            msg = (
+                f"survey_time {time!r} lies before the present epoch's {self._survey_time!r} (days since 1970-01-01). "
+                "Learn epochs in order of time."
+            )
+            raise ValueError(msg)
+        if time > self._survey_time:
+            logger.info("%s begins a new epoch and drops %d points", type(self).__name__, len(self._observations))
             self._learn(points, time)
         else:
-            self._learn(np.hstack([self._points, points]), self._survey_time)
+            self._learn(np.hstack([self._points, points]), time)
         return self
 
     def predict(self, coordinates: Coordinates) -> Prediction:
@@ -183,14 +165,15 @@ class PointModel(ABC, Generic[Prepared]):
         if observations is None or prepared is None:
             msg = f"{type(self).__name__} has learned nothing yet; call fit first."
             raise ValueError(msg)
-        easting, northing = _positions(coordinates)
+        easting, northing = check_positions(coordinates)
         layers = np.empty((4, easting.size))
-        for first in range(0, easting.size, self._block_size):
-            block = slice(first, first + self._block_size)
-            answer = self._answer(
-                prepared, easting[block] - observations.origin[0], northing[block] - observations.origin[1]
-            )
-            layers[:, block] = answer.elevation, answer.elevation_std, answer.noise_std, answer.n_effective
+        with _one_thread():
+            for first in range(0, easting.size, self._block_size):
+                block = slice(first, first + self._block_size)
+                answer = self._answer(
+                    prepared, easting[block] - observations.origin[0], northing[block] - observations.origin[1]
+                )
+                layers[:, block] = answer.elevation, answer.elevation_std, answer.noise_std, answer.n_effective
         return _prediction(layers, observations.datum)
 
     def copy(self) -> Self:
@@ -222,17 +205,14 @@ class PointModel(ABC, Generic[Prepared]):
         names = ("easting", "northing", "elevation", "variance")
         units = ("m", "m", "m", "m2")
         dataset = xr.Dataset(
-            {
-                name: ("point", row, {"units": unit})
-                for name, row, unit in zip(names, self._points, units, strict=True)
-            },
+            {name: ("point", row, {"units": unit}) for name, row, unit in zip(names, self._points, units, strict=True)},
             attrs={
                 "format_version": _FORMAT_VERSION,
                 "model": type(self).__name__,
                 "settings": json.dumps(self.settings()),
                 # hexadecimal, so that the parameters come back bit for bit
                 "parameters": json.dumps({name: value.hex() for name, value in self.parameters_.items()}),
-                "survey_time": "" if self._survey_time is None else self._survey_time.hex(),
+                "survey_time": self._survey_time.hex(),
             },
         )
         write_dataset(Path(directory) / _FILE_NAME, dataset)
@@ -256,17 +236,18 @@ class PointModel(ABC, Generic[Prepared]):
             model = cls(**json.loads(dataset.attrs["settings"]))
             parameters = json.loads(dataset.attrs["parameters"])
             model.parameters_ = {name: float.fromhex(value) for name, value in parameters.items()}
-            time = dataset.attrs["survey_time"]
+            time = float.fromhex(dataset.attrs["survey_time"])
             points = np.stack([dataset[name].values for name in ("easting", "northing", "elevation", "variance")])
         except (KeyError, TypeError, ValueError) as error:
             msg = f"{path} is not a whole {cls.__name__}: {error}. Fit the model again and save it."
             raise ModelStateError(msg) from error
-        model._points, model._survey_time = points, float.fromhex(time) if time else None
-        model._observations = _observations(points)
-        model._prepared = model._prepare(model._observations, model.parameters_)
+        model._points, model._survey_time = points, time
+        model._observations = observations_from(points)
+        with _one_thread():
+            model._prepared = model._prepare(model._observations, model.parameters_)
         return model
 
-    def _learn(self, points: FloatArray, survey_time: float | None) -> None:
+    def _learn(self, points: FloatArray, survey_time: float) -> None:
         """Learn `points` alone; the model is untouched when this fails."""
         n_points = points.shape[1]
         if n_points < MIN_POINTS:
@@ -279,28 +260,12 @@ class PointModel(ABC, Generic[Prepared]):
             )
             raise ValueError(msg)
         points = points[:, np.lexsort(points[::-1])]
-        observations = _observations(points)
-        parameters = self._estimate(observations)
-        prepared = self._prepare(observations, parameters)
+        observations = observations_from(points)
+        with _one_thread():
+            parameters = self._estimate(observations)
+            prepared = self._prepare(observations, parameters)
         self._points, self._survey_time = points, survey_time
         self._observations, self.parameters_, self._prepared = observations, parameters, prepared
-
-    def _is_new_epoch(self, survey_time: float | None) -> bool:
-        if survey_time is None:
-            return False
-        if self._survey_time is None:
-            msg = (
-                f"The points learned so far have no survey_time, so {survey_time!r} cannot be placed before or after "
-                "them. Give survey_time to fit as well."
-            )
-            raise ValueError(msg)
-        if survey_time < self._survey_time:
-            msg = (
-                f"survey_time {survey_time!r} lies before the present epoch's {self._survey_time!r} (days since "
-                "1970-01-01). Learn epochs in order of time."
-            )
-            raise ValueError(msg)
-        return survey_time > self._survey_time
 
     @abstractmethod
     def _estimate(self, observations: Observations) -> dict[str, float]:
@@ -315,58 +280,19 @@ class PointModel(ABC, Generic[Prepared]):
         """Answer at places relative to the origin; `n_effective` is 0 where the observations say nothing."""
 
 
-def _stack(coordinates: Coordinates, elevation: FloatArray, sigma: FloatArray | None) -> FloatArray:
-    """Check observations and stack easting, northing, elevation and variance, shape (4, n)."""
-    easting, northing = _positions(coordinates)
-    heights = _vector(elevation, "elevation", easting.size)
-    if sigma is None:
-        return np.stack([easting, northing, heights, np.zeros(easting.size)])
-    spread = _vector(sigma, "sigma", easting.size)
-    if np.any(spread <= 0.0):
-        msg = f"Every sigma must be positive, in metres; the smallest is {spread.min()!r}."
-        raise ValueError(msg)
-    return np.stack([easting, northing, heights, spread**2])
+def _one_thread() -> AbstractContextManager[object]:
+    """
+    Keep BLAS to one thread inside a `with` block, if threadpoolctl, which comes with scikit-learn, is there.
 
-
-def _positions(coordinates: Coordinates) -> tuple[FloatArray, FloatArray]:
-    if not isinstance(coordinates, tuple | list) or len(coordinates) != 2:
-        msg = f"coordinates must be (easting, northing), two arrays; got {type(coordinates).__name__}."
-        raise ValueError(msg)
-    easting = _vector(coordinates[0], "easting", None)
-    return easting, _vector(coordinates[1], "northing", easting.size)
-
-
-def _vector(values: FloatArray, name: str, size: int | None) -> FloatArray:
-    """Return `values` as a finite 1-D float64 array of its own."""
-    array = np.array(values)
-    if array.ndim != 1 or array.dtype.kind not in "fiu":
-        msg = f"{name} must be a 1-D array of real numbers; got shape {array.shape}, dtype {array.dtype}."
-        raise ValueError(msg)
-    if size is not None and array.size != size:
-        msg = f"{name} has {array.size} values where easting has {size}; they must agree."
-        raise ValueError(msg)
-    array = array.astype(np.float64)
-    finite = np.isfinite(array)
-    if not finite.all():
-        msg = f"{name} must be finite; {int((~finite).sum())} of {array.size} values are NaN or infinite."
-        raise ValueError(msg)
-    return array
-
-
-def _valid_time(survey_time: float | None) -> float | None:
-    if survey_time is None:
-        return None
-    if not np.isfinite(survey_time):
-        msg = f"survey_time must be a finite number of days since 1970-01-01; got {survey_time!r}."
-        raise ValueError(msg)
-    return float(survey_time)
-
-
-def _observations(points: FloatArray) -> Observations:
-    easting, northing, elevation, variance = points
-    origin = (float(np.round(np.median(easting))), float(np.round(np.median(northing))))
-    datum = float(elevation.mean())
-    return Observations(easting - origin[0], northing - origin[1], elevation - datum, variance, origin, datum)
+    Threads that wait for each other made factorisations of a few hundred points ten times slower on a busy machine,
+    and their number changes the last bits of the result.
+    """
+    try:
+        threadpoolctl = import_module("threadpoolctl")
+    except ImportError:
+        return nullcontext()
+    limit: AbstractContextManager[object] = threadpoolctl.threadpool_limits(limits=1, user_api="blas")
+    return limit
 
 
 def _prediction(layers: FloatArray, datum: float) -> Prediction:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from changedetect.models.comparators.base import LocalAnswer, Observations, PointModel
+from changedetect.models.comparators.base import LocalAnswer, PointModel
+from changedetect.models.comparators.observations import Observations, distance_to_kth
 
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray, IntArray
@@ -59,12 +59,9 @@ class BlockMean(PointModel[_Blocks]):
                 msg = f"The side of a block must be positive, in metres; got {self.side!r}."
                 raise ValueError(msg)
             return {"side": float(self.side)}
-        positions = observations.positions
-        k = min(self.points_per_block + 1, len(positions))
-        sample = positions[:: max(1, len(positions) // 2000)]
-        to_kth = cKDTree(positions).query(sample, k=[k])[0][:, 0]
-        disc = np.pi * max(float(np.median(to_kth)) ** 2, 1e-12)
-        return {"side": float(np.sqrt(disc * self.points_per_block / (k - 1)))}
+        k = min(self.points_per_block, len(observations) - 1)
+        disc = np.pi * distance_to_kth(observations.positions, k) ** 2
+        return {"side": float(np.sqrt(disc * self.points_per_block / k))}
 
     def _prepare(self, observations: Observations, parameters: dict[str, float]) -> _Blocks:
         side = parameters["side"]

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import Bounds, minimize
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from changedetect.models.comparators.base import LocalAnswer
+from changedetect.models.comparators.observations import Observations, nearest
 
 if TYPE_CHECKING:
-    from changedetect.models.comparators.base import Observations
     from changedetect.typing import FloatArray
 
 __all__ = [
@@ -135,7 +135,7 @@ def likelihood_blocks(
         members = np.sort(rng.choice(n_points, block_size, replace=False))[None]
     else:
         seeds = rng.choice(n_points, min(n_blocks, n_points), replace=False)
-        members = cKDTree(observations.positions).query(observations.positions[seeds], k=block_size)[1]
+        _, members = nearest(cKDTree(observations.positions), observations.positions[seeds], block_size)
     distance = np.stack([cdist(block, block) for block in observations.positions[members]])
     return distance, observations.elevation[members], observations.variance[members]
 
@@ -222,12 +222,14 @@ def estimate_covariance(
         raise ValueError(msg)
     spacing = extent / np.sqrt(len(observations))
     relief = max(float(observations.elevation.var()), 1e-8)
-    bounds = np.log([(1e-4 * relief, 1e4 * relief), (0.2 * spacing, 10.0 * extent), (1e-8 * relief, 10.0 * relief)])
+    # wider bounds let flat ground run away to lengths at which everything is extrapolation
+    ranges = [(1e-4 * relief, 100.0 * relief), (0.2 * spacing, 2.0 * extent), (1e-8 * relief, 10.0 * relief)]
+    bounds = Bounds(*np.log(ranges).T)
     starts = [(relief, scale, 0.05 * relief) for scale in (4.0 * spacing, np.sqrt(spacing * extent), 0.3 * extent)]
     fits = [
         minimize(
             negative_log_likelihood,
-            np.clip(np.log(start), bounds[:, 0], bounds[:, 1]),
+            np.clip(np.log(start), bounds.lb, bounds.ub),
             args=(kernel, *blocks),
             jac=True,
             method="L-BFGS-B",

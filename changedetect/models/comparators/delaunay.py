@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
 
-from changedetect.models.comparators.base import LocalAnswer, Observations, PointModel
+from changedetect.models.comparators.base import LocalAnswer, PointModel
+from changedetect.models.comparators.observations import Observations
 
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray

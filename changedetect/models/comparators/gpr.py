@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from changedetect.models.comparators.base import LocalAnswer, Observations, PointModel
+from changedetect.models.comparators.base import LocalAnswer, PointModel
 from changedetect.models.comparators.covariance import Covariance, Kernel, answer_from_moments
+from changedetect.models.comparators.observations import Observations
 
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray
@@ -98,9 +99,7 @@ class ExactGPR(PointModel[_Posterior]):
         return answer_from_moments(prepared.covariance, elevation, variance)
 
 
-def _regressor(
-    covariance: Covariance, variance: FloatArray, bounds: tuple[tuple[float, float], ...] | None
-) -> Any:
+def _regressor(covariance: Covariance, variance: FloatArray, bounds: tuple[tuple[float, float], ...] | None) -> Any:
     """Scikit-learn's regressor for a covariance; its hyper-parameters are fitted where `bounds` are given."""
     process, kernels = _scikit_learn("gaussian_process"), _scikit_learn("gaussian_process.kernels")
     ranges = ("fixed", "fixed", "fixed") if bounds is None else bounds

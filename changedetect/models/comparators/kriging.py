@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from scipy.spatial import cKDTree
 
-from changedetect.models.comparators.base import LocalAnswer, Observations, PointModel
+from changedetect.models.comparators.base import LocalAnswer, PointModel
 from changedetect.models.comparators.covariance import Covariance, Kernel, answer_from_moments, estimate_covariance
+from changedetect.models.comparators.observations import Observations, nearest
 
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray
@@ -77,7 +78,7 @@ class NeighbourKriging(PointModel[_Neighbourhood]):
         observations, covariance = prepared.observations, prepared.covariance
         places = np.column_stack([easting, northing])
         n_neighbours = min(self.n_neighbours, len(observations))
-        distance, members = prepared.tree.query(places, k=n_neighbours)
+        distance, members = nearest(prepared.tree, places, n_neighbours)
         positions = observations.positions[members]
         between = np.linalg.norm(positions[:, :, None, :] - positions[:, None, :, :], axis=-1)
         system = covariance.at_distance(between)

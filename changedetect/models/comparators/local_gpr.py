@@ -9,8 +9,9 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.spatial import cKDTree
 
-from changedetect.models.comparators.base import LocalAnswer, Observations, PointModel
+from changedetect.models.comparators.base import LocalAnswer, PointModel
 from changedetect.models.comparators.covariance import Covariance, Kernel, answer_from_moments, estimate_covariance
+from changedetect.models.comparators.observations import Observations, distance_to_kth, nearest
 
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray, IntArray
@@ -42,7 +43,10 @@ class LocalGPR(PointModel[_LocalModels]):
     Attributes
     ----------
     points_per_model : int
-        Aimed at; sets the width of the weights from the density of the observations.
+        Aimed at, for the observations nearest to a centre; sets the distance of the centres from the density.
+    overlap : float
+        A model learns all observations within this many founding distances of its centre. 0 gives it only those
+        nearest to it, as in the paper.
     generation_threshold : float, between 0 and 1
         An observation founds a new local model where all weights are at most this (w_gen).
     n_blended : int
@@ -60,7 +64,9 @@ class LocalGPR(PointModel[_LocalModels]):
     nearest models, eq. 5. Its variance is that of the mixture, sum w_k (v_k + (m_k - m)^2) / sum w_k, its effective
     number of observations the weighted mean of theirs. The paper moves a centre to the mean of its points as they
     arrive and limits a model's size by removing points; here centres are found first, in random order, and each
-    observation then belongs to the nearest one. A model without information about a place is not blended.
+    observation then belongs to the nearest one, and to all within reach of it where models overlap: a Gaussian process
+    returns to its mean at the border of its points, which is where models are blended. A model without information
+    about a place is not blended.
 
     References
     ----------
@@ -68,7 +74,8 @@ class LocalGPR(PointModel[_LocalModels]):
        Advanced Robotics 23(15), doi:10.1163/016918609X12529286896877.
     """
 
-    points_per_model: int = 100
+    points_per_model: int = 30
+    overlap: float = 1.6
     generation_threshold: float = 0.5
     n_blended: int = 3
     kernel: Kernel = "matern32"
@@ -95,8 +102,13 @@ class LocalGPR(PointModel[_LocalModels]):
         order = np.random.default_rng(self.random_seed).permutation(len(positions))
         founders = _founders(positions, order, radius)
         _, owner = cKDTree(positions[founders]).query(positions)
-        centres = np.column_stack([np.bincount(owner, axis) / np.bincount(owner) for axis in positions.T])
-        members = np.split(np.argsort(owner, kind="stable"), np.cumsum(np.bincount(owner))[:-1])
+        count = np.bincount(owner)
+        centres = np.column_stack([np.bincount(owner, axis) / count for axis in positions.T])
+        if self.overlap > 0.0:
+            within = cKDTree(positions).query_ball_point(centres, self.overlap * radius, return_sorted=True)
+            members = [np.array(chosen, dtype=np.int64) for chosen in within]
+        else:
+            members = np.split(np.argsort(owner, kind="stable"), np.cumsum(count)[:-1])
         return _LocalModels(
             centres=cKDTree(centres),
             models=tuple(_local_model(observations, chosen, covariance) for chosen in members),
@@ -107,12 +119,12 @@ class LocalGPR(PointModel[_LocalModels]):
     def _answer(self, prepared: _LocalModels, easting: FloatArray, northing: FloatArray) -> LocalAnswer:
         places = np.column_stack([easting, northing])
         n_blended = min(self.n_blended, len(prepared.models))
-        distance, nearest = prepared.centres.query(places, k=range(1, n_blended + 1))
+        distance, owner = nearest(prepared.centres, places, n_blended)
         # relative to the nearest centre: the ratio is the same, and nothing underflows far away
         weight = np.exp(-0.5 * (distance**2 - distance[:, :1] ** 2) / prepared.width**2)
         total, first, second, variance, n_effective = np.zeros((5, len(places)))
-        by_model = np.argsort(nearest, axis=None, kind="stable")
-        ends = np.cumsum(np.bincount(nearest.ravel(), minlength=len(prepared.models)))
+        by_model = np.argsort(owner, axis=None, kind="stable")
+        ends = np.cumsum(np.bincount(owner.ravel(), minlength=len(prepared.models)))
         for model, asked in zip(prepared.models, np.split(by_model, ends[:-1]), strict=True):
             here, rank = np.divmod(asked, n_blended)
             local = _local_answer(model, places[here], prepared.covariance)
@@ -140,10 +152,8 @@ def _founding_radius(positions: FloatArray, points_per_model: int) -> float:
     Discs of diameter `radius` packed at random cover 0.547 of the ground at jamming, so centres no closer than
     `radius` own 0.547^-1 pi radius^2 / 4 each. Density is the median over the neighbourhoods of the points.
     """
-    k = min(points_per_model, len(positions))
-    sample = positions[:: max(1, len(positions) // 2000)]
-    to_kth = cKDTree(positions).query(sample, k=[k])[0][:, 0]
-    density = k / (np.pi * max(float(np.median(to_kth)) ** 2, 1e-12))
+    k = min(points_per_model, len(positions) - 1)
+    density = k / (np.pi * distance_to_kth(positions, k) ** 2)
     return float(np.sqrt(4.0 * 0.547 * points_per_model / (np.pi * density)))
 
 
@@ -171,6 +181,4 @@ def _local_model(observations: Observations, members: IntArray, covariance: Cova
 def _local_answer(model: _LocalModel, places: FloatArray, covariance: Covariance) -> LocalAnswer:
     cross = covariance.between(model.positions, places)
     explained = np.sum(solve_triangular(model.factor, cross, lower=True) ** 2, axis=0)
-    return answer_from_moments(
-        covariance, model.mean + model.weights @ cross, covariance.signal_variance - explained
-    )
+    return answer_from_moments(covariance, model.mean + model.weights @ cross, covariance.signal_variance - explained)

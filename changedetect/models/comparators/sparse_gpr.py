@@ -8,16 +8,19 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from changedetect.models.comparators.base import LocalAnswer, Observations, PointModel
+from changedetect.models.comparators.base import LocalAnswer, PointModel
 from changedetect.models.comparators.covariance import Covariance, Kernel, answer_from_moments, estimate_covariance
+from changedetect.models.comparators.observations import Observations
 
 if TYPE_CHECKING:
-    from changedetect.typing import FloatArray
+    from changedetect.typing import FloatArray, IntArray
 
 __all__ = ["SparseGPR", "inducing_points"]
 
 #: Observations projected at once: bounds memory at this times the number of inducing points.
 _PROJECTION_BLOCK = 8_192
+#: Cells do not get smaller than this where positions repeat, m.
+_FINEST_CELL = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +68,7 @@ class SparseGPR(PointModel[_InducingPosterior]):
     approximation: Literal["fitc", "sgpr"] = "fitc"
     kernel: Kernel = "matern32"
     n_blocks: int = 1
-    block_size: int = 800
+    block_size: int = 500
     random_seed: int = 0
     max_points: int | None = 1_000_000
 
@@ -129,18 +132,23 @@ def inducing_points(positions: FloatArray, n_inducing: int) -> FloatArray:
     Square cells, made smaller until enough of them hold observations; of each the one nearest the cell's mean.
     """
     if len(positions) <= n_inducing:
-        return np.unique(positions, axis=0)
-    corner, extent = positions.min(axis=0), np.ptp(positions, axis=0)
-    side = float(np.sqrt(max(extent[0] * extent[1], 1e-6 * extent.max() ** 2) / n_inducing))
-    for _ in range(20):
-        cell = np.floor((positions - corner) / side).astype(np.int64)
-        _, label = np.unique(cell, axis=0, return_inverse=True)
-        if label.max() + 1 >= 0.95 * n_inducing:
-            break
-        side *= 0.9
+        return np.asarray(np.unique(positions, axis=0))
+    corner = positions.min(axis=0)
+    side = float(np.ptp(positions, axis=0).max()) / np.sqrt(n_inducing)
+    label = _cell_labels(positions - corner, side)
+    while label.max() + 1 < 0.95 * n_inducing and side > _FINEST_CELL:
+        side *= 0.95
+        label = _cell_labels(positions - corner, side)
     count = np.bincount(label)
     middle = np.column_stack([np.bincount(label, axis) / count for axis in positions.T])
     from_middle = np.sum((positions - middle[label]) ** 2, axis=1)
     order = np.lexsort((from_middle, label))
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    return positions[order[first]]
+    return np.asarray(positions[order[first]])
+
+
+def _cell_labels(positions: FloatArray, side: float) -> IntArray:
+    """Number the occupied square cells and say which one each position lies in."""
+    cell = np.floor(positions / side).astype(np.int64)
+    _, label = np.unique(cell[:, 0] * 2**32 + cell[:, 1], return_inverse=True)
+    return np.asarray(label, dtype=np.int64)

@@ -1,0 +1,73 @@
+"""Arguments and options that several commands share, and the reading of their texts."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+__all__ = [
+    "Bounds",
+    "Directory",
+    "DryRun",
+    "EpochId",
+    "Model",
+    "Overwrite",
+    "Pairs",
+    "Resolution",
+    "parse_classes",
+    "parse_columns",
+]
+
+
+class Pairs(StrEnum):
+    """Which epochs are differenced."""
+
+    CONSECUTIVE = "consecutive"
+    FIRST = "first"
+    ALL = "all"
+
+
+class Model(StrEnum):
+    """Surface models a programme can be learned with."""
+
+    ADAPTIVE = "adaptive"
+    REFERENCE = "reference"
+
+
+Directory = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the programme.", show_default=False)]
+EpochId = Annotated[str, typer.Argument(metavar="EPOCH_ID", help="Epoch, such as 2024-05-01.", show_default=False)]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what exists; refused otherwise (exit code 73).")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", "-n", help="Check everything, say what would be done, write nothing.")
+]
+Bounds = Annotated[
+    tuple[float, float, float, float] | None,
+    typer.Option("--bounds", metavar="WEST EAST SOUTH NORTH", help="Region in the programme's CRS, m."),
+]
+Resolution = Annotated[float | None, typer.Option("--resolution", help="Cell size of the rasters, m.")]
+
+
+def parse_classes(texts: list[str] | None) -> tuple[int, ...] | None:
+    """
+    Read point classes, repeated or separated by commas.
+
+    Raises
+    ------
+    typer.BadParameter
+        A text is no whole number.
+    """
+    if not texts:
+        return None
+    parts = [part.strip() for text in texts for part in text.split(",") if part.strip()]
+    if not all(part.isdecimal() for part in parts):
+        msg = f"classes are whole numbers such as 2 or 2,9; got {', '.join(texts)}"
+        raise typer.BadParameter(msg, param_hint="--classes")
+    return tuple(int(part) for part in parts)
+
+
+def parse_columns(text: str | None) -> tuple[str, ...] | None:
+    """Read names of columns, separated by commas."""
+    return None if text is None else tuple(part.strip() for part in text.split(","))
