@@ -1,4 +1,4 @@
-"""Small surveys for tests of whole programmes: a tilted, rippled square of 24 m with a block that may be raised."""
+"""Small surveys for tests of whole programmes: a tilted, rippled square of 20 m with a block that may be raised."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from changedetect.io.las import write_points
 from changedetect.pointcloud import PointCloud
 
 CRS = "EPSG:32632+5773"
-WEST, SOUTH, SIDE = 500000.0, 5300000.0, 24.0
+WEST, SOUTH, SIDE = 500000.0, 5300000.0, 20.0
 #: Ground (west, east, south, north) that `survey(step=...)` raises.
-BLOCK = (WEST + 8.0, WEST + 16.0, SOUTH + 8.0, SOUTH + 16.0)
+BLOCK = (WEST + 6.0, WEST + 14.0, SOUTH + 6.0, SOUTH + 14.0)
 
 
-def survey(seed=0, *, step=0.0, offset=0.0, n_points=2500, noise=0.02, shift=0.0, sigma=None, classification=None):
+def survey(seed=0, *, step=0.0, offset=0.0, n_points=1800, noise=0.02, shift=0.0, sigma=None, classification=None):
     """Points on the square, its block raised by `step`, everything by `offset`, moved east by `shift` metres."""
     rng = np.random.default_rng(seed)
     easting = np.round(WEST + rng.uniform(0.0, SIDE, n_points), 3)
@@ -45,7 +45,7 @@ def make_programme(directory: Path, surveys, **settings) -> Programme:
 
     `surveys` maps epoch ids, which are dates, to arguments of `survey`; the files get no checksums.
     """
-    programme = Programme.create(directory, {"name": "site", "crs": CRS, "resolution": 1.0, **settings})
+    programme = Programme.create(directory, {"name": "site", "crs": CRS, "resolution": 0.5, **settings})
     for number, (epoch_id, arguments) in enumerate(surveys.items()):
         add_by_hand(directory, epoch_id, **{"seed": number, **arguments})
     return reopen(programme)

@@ -463,7 +463,7 @@ def test_an_installed_geoid_grid_is_used(tmp_path: Path) -> None:
         count=1,
         dtype="float32",
         crs="EPSG:4326",
-        transform=rasterio.transform.from_origin(4.0, 53.0, 0.25, 0.25),
+        transform=rasterio.Affine(0.25, 0, 4.0, 0, -0.25, 53.0),
     ) as dataset:
         dataset.write(np.full((1, 41, 41), 47.25, np.float32))
         dataset.update_tags(TYPE="VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL", AREA_OR_POINT="Point")

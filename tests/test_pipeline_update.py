@@ -94,13 +94,14 @@ def test_an_update_makes_models_maps_and_differences(learned):
     assert rasters | {"change.nc", "summary.json", "manifest.json"} <= change
 
 
-def test_a_step_of_half_a_metre_comes_out_as_half_a_metre(learned):
+def test_a_step_between_two_epochs_stands_in_the_map(learned):
     values, grid, _ = dod(learned, FIRST, SECOND)
     easting, northing = grid.coordinates()
     west, east, south, north = BLOCK
-    inside = (easting > west + 2) & (easting < east - 2) & (northing > south + 2) & (northing < north - 2)
-    outside = (easting < west - 2) | (easting > east + 2) | (northing < south - 2) | (northing > north + 2)
-    np.testing.assert_allclose(np.nanmean(values.ravel()[inside]), 0.5, rtol=0, atol=0.005)
+    inside = (easting > west + 3) & (easting < east - 3) & (northing > south + 3) & (northing < north - 3)
+    outside = (easting < west - 3) | (easting > east + 3) | (northing < south - 3) | (northing > north + 3)
+    # 4.5 points a square metre, noise 2 cm: the mean over 4 m2 is good to about 1 cm
+    np.testing.assert_allclose(np.nanmean(values.ravel()[inside]), 0.5, rtol=0, atol=0.015)
     np.testing.assert_allclose(np.nanmean(values.ravel()[outside]), 0.0, rtol=0, atol=0.005)
 
 
@@ -120,7 +121,7 @@ def test_checksums_of_hand_written_sources_are_recorded_when_they_are_learned(le
     record, _ = learned.state_record(FIRST)
     path = learned.directory / "inputs" / f"{FIRST}.laz"
     assert record.sources[0].sha256 == sha256_of_file(path)
-    assert (record.sources[0].n_read, record.n_points) == (2500, 2500)
+    assert (record.sources[0].n_read, record.n_points) == (1800, 1800)
 
 
 def test_the_run_manifest_says_what_was_done_and_with_what(learned):
@@ -137,7 +138,7 @@ def test_the_run_manifest_says_what_was_done_and_with_what(learned):
 
 def test_all_maps_of_a_programme_share_their_cells_and_colours(learned):
     grids = [dod(learned, *pair.product_id.split("_"))[1] for pair in learned.pairs()]
-    assert all(grid.west % 1.0 == 0.0 and grid.north % 1.0 == 0.0 for grid in grids)
+    assert all(grid.west % 0.5 == 0.0 and grid.north % 0.5 == 0.0 for grid in grids)
     records = [learned.product_record(pair.product_id)[0] for pair in learned.pairs()]
     assert len({json.dumps(record.colour_limits) for record in records}) == 1
     low, high = records[0].colour_limits["dod"]
@@ -151,8 +152,8 @@ def test_maps_cover_exactly_the_bounds_and_points_outside_are_left_out(tmp_path)
     _, grid, _ = read_cog(programme.product_directory(FIRST) / "elevation.tif")
     assert grid.region == bounds
     record, _ = programme.state_record(FIRST)
-    assert record.sources[0].n_read == 2500
-    np.testing.assert_allclose(record.n_points, 2500 * 256 / 576, rtol=0.05, atol=0)
+    assert record.sources[0].n_read == 1800
+    np.testing.assert_allclose(record.n_points, 1800 * 256 / 400, rtol=0.05, atol=0)
 
 
 def test_the_reference_mode_runs_the_whole_chain(tmp_path):
@@ -306,7 +307,9 @@ def test_a_late_survey_rebuilds_what_follows_it_without_reading_those_sources_ag
     origins = {step["id"]: step["origin"] for step in result.steps if step["kind"] == "model"}
     assert origins == {"2024-04-01": "sources", SECOND: "stored evidence", THIRD: "stored evidence"}
     assert manifests(site)[FIRST] == before[FIRST]
-    assert verify(reopen(site), check_sources=False) == ()
+    assert {(finding.severity, finding.subject.split("/")[0]) for finding in verify(reopen(site))} == {
+        ("warning", "epochs")
+    }
 
 
 def test_incremental_and_late_learning_equal_learning_from_scratch(site, tmp_path):
@@ -406,7 +409,7 @@ def test_sources_of_one_epoch_are_learned_together(tmp_path):
     path = programme.epoch_path(FIRST)
     path.write_text(path.read_text() + '[[sources]]\nuri = "inputs/other.laz"\n')
     assert update(reopen(programme)).exit_code == 0
-    assert programme.state_record(FIRST)[0].n_points == 5000
+    assert programme.state_record(FIRST)[0].n_points == 3600
 
 
 def test_an_unwritable_folder_is_told_and_nothing_is_lost(tmp_path):

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from changedetect.kernels.receptive_fields import N_PLANE
 from changedetect.models.cells import merge_cells
-from changedetect.models.pyramid import CENTROID_LIMIT, N_MINIMUM, Lattice, Level, build_level, fit_lattice
+from changedetect.models.pyramid import CENTROID_LIMIT, N_MINIMUM, CellPyramid, Lattice, Level, build_level, fit_lattice
 
 if TYPE_CHECKING:
     from changedetect.models.cells import Cells
@@ -66,7 +67,7 @@ def _joint_region(earlier: Cells, later: Cells) -> Region:
 
 
 def _surface(cells: Cells, region: Region, kernel: float) -> Level:
-    return build_level(cells, Lattice.covering(region, kernel, _SPACING * kernel), 0.0, None)
+    return build_level(CellPyramid(cells).for_kernel(kernel), Lattice.covering(region, kernel, _SPACING * kernel), 0.0, None)
 
 
 def _without(cells: Cells, level: Level, sign: float = 1.0) -> Cells:
@@ -75,13 +76,20 @@ def _without(cells: Cells, level: Level, sign: float = 1.0) -> Cells:
 
 
 def _change(earlier: Cells, later: Cells, region: Region, kernel: float) -> Level:
-    """Difference of the local planes of what two epochs leave over the shared surface."""
-    a, b = _surface(earlier, region, kernel), _surface(later, region, kernel)
-    planes = b.planes.copy()
-    both = (a.planes[4] > 0.0) & (b.planes[4] > 0.0)
-    planes[:3] = np.where(both, b.planes[:3] - a.planes[:3], 0.0)
+    """
+    Difference of the local planes of what two epochs leave over the shared surface.
+
+    Only where both epochs surround a field: an extrapolated change would be taken off ground that one epoch alone saw
+    and would grow from round to round.
+    """
+    lattice = Lattice.covering(region, kernel, _SPACING * kernel)
+    a, b = (fit_lattice(CellPyramid(cells).for_kernel(kernel), lattice) for cells in (earlier, later))
+    both = _is_observed(a) & _is_observed(b)
+    planes = np.zeros((N_PLANE, *lattice.shape))
+    for k, scale in enumerate((1.0, kernel, kernel)):
+        planes[k] = np.where(both, b[..., k] - a[..., k], 0.0) / scale
     planes[4] = both
-    return Level(b.lattice, planes)
+    return Level(lattice, planes)
 
 
 def estimate_difference(
@@ -120,7 +128,7 @@ def estimate_difference(
         left = (_without(earlier, shared), _without(later, shared))
         change = _change(*left, region, wide)
     output = Lattice(wide, lattice.spacing, lattice.first_row, lattice.first_column, *lattice.shape)
-    fits = [fit_lattice(cells, output) for cells in left]
+    fits = [fit_lattice(CellPyramid(cells).for_kernel(wide), output) for cells in left]
     reach = max(3, round(4.0 * wide / lattice.spacing) | 1)
     variances, freedoms = zip(*(_value_variance(fit, reach) for fit in fits), strict=True)
     variance = variances[0] + variances[1]

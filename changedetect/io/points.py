@@ -8,11 +8,12 @@ a LAS file without a suffix is read as LAS, a text file called .laz is refused.
 from __future__ import annotations
 
 import logging
+import warnings
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from changedetect.crs import make_transform
+from changedetect.crs import is_geographic, make_transform
 from changedetect.errors import InputDataError, MissingInputError
 from changedetect.io.source import CHUNK_SIZE, PointSource, SourceOptions
 from changedetect.pointcloud import PointCloud, check_count, check_finite, check_not_degrees, check_values
@@ -131,16 +132,17 @@ def iter_programme_chunks(
     """
     n_points = 0
     with _naming(source.path):
-        transform = make_transform(source.require_crs(), programme_crs, coordinate_epoch=coordinate_epoch)
+        source_crs = source.require_crs()
+        transform = make_transform(source_crs, programme_crs, coordinate_epoch=coordinate_epoch)
     for chunk in source.iter_chunks(chunk_size):
         where = f"{source.path}, points from {n_points} on" if n_points else str(source.path)
         check_finite(chunk, where)
+        if n_points == 0 and not is_geographic(source_crs):
+            check_not_degrees(chunk, where)
         with _naming(source.path):
             easting, northing, elevation = transform(*chunk.coordinates, chunk.elevation)
         cloud = PointCloud(easting, northing, elevation, chunk.sigma, chunk.classification)
         check_values(cloud, where)
-        if transform.is_identity and n_points == 0:
-            check_not_degrees(cloud, where)
         n_points += len(cloud)
         yield cloud
     check_count(n_points, str(source.path))
@@ -245,10 +247,12 @@ def _n_numbers(line: str) -> int:
 
 def _is_raster(path: Path) -> bool:
     import rasterio
-    from rasterio.errors import RasterioIOError
+    from rasterio.errors import NotGeoreferencedWarning, RasterioIOError
 
     try:
-        with rasterio.open(path):
-            return True
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)  # refused when it is opened in earnest
+            rasterio.open(path).close()
+        return True
     except RasterioIOError:
         return False

@@ -184,7 +184,8 @@ def write_table(path: Path, columns: Mapping[str, FloatArray], *, decimals: int 
 
 def _formatted(values: FloatArray, decimals: int) -> list[str]:
     pattern = f"%.{decimals}f"
-    return ["" if value != value else pattern % value for value in values.tolist()]  # noqa: PLR0124  NaN alone differs
+    rounded = np.round(values, decimals) + 0.0  # no minus sign before a zero
+    return ["" if math.isnan(value) else pattern % value for value in rounded.tolist()]
 
 
 def _fault(line: str, fmt: TableFormat, nodata: float | None) -> str | None:

@@ -213,9 +213,9 @@ def _commented_header(
     if not before:
         return None
     text = before[-1].strip().lstrip("#/").strip()
-    for candidate in {delimiter, None, ","}:
+    for candidate in dict.fromkeys((delimiter, ",", None)):
         names = tuple(split_line(text, candidate)) if text else ()
-        if len(names) == n_fields and any(_plain(name) in _ELEVATION for name in names):
+        if len(names) == n_fields and any(_plain(name) in _ELEVATION for name in names) and _horizontal_pairs(names):
             return names
     return None
 
@@ -275,11 +275,7 @@ def _recognised_columns(path: Path, names: tuple[str, ...], crs: str | None) -> 
     plain = [_plain(name) for name in names]
     elevation = [i for i, name in enumerate(plain) if name in _ELEVATION]
     sigma = [i for i, name in enumerate(plain) if name in _SIGMA]
-    pairs = [
-        (plain.index(next(iter(eastings & set(plain)))), plain.index(next(iter(northings & set(plain)))), degrees)
-        for eastings, northings, degrees in _HORIZONTAL
-        if eastings & set(plain) and northings & set(plain)
-    ]
+    pairs = _horizontal_pairs(names)
     if crs is not None and len(pairs) > 1:
         wants_degrees = is_geographic(crs)
         pairs = [pair for pair in pairs if pair[2] == wants_degrees] or pairs
@@ -288,6 +284,18 @@ def _recognised_columns(path: Path, names: tuple[str, ...], crs: str | None) -> 
     easting, northing, degrees = pairs[0]
     _check_kind(path, names[easting], names[northing], degrees=degrees, crs=crs)
     return (easting, northing, elevation[0], *sigma)
+
+
+def _horizontal_pairs(names: tuple[str, ...]) -> list[tuple[int, int, bool]]:
+    """Positions of all easting and northing columns of one kind, and whether they are degrees."""
+    plain = [_plain(name) for name in names]
+    return [
+        (i, j, degrees)
+        for eastings, northings, degrees in _HORIZONTAL
+        for i, easting in enumerate(plain)
+        for j, northing in enumerate(plain)
+        if easting in eastings and northing in northings
+    ]
 
 
 def _check_kind(path: Path, easting: str, northing: str, *, degrees: bool, crs: str | None) -> None:

@@ -151,12 +151,13 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
             g20 = i02 * t0 + i12 * t1 + i22 * t2
             g21 = i02 * t1 + i12 * t3 + i22 * t4
             g22 = i02 * t2 + i12 * t4 + i22 * t5
-            o[3] = g00 * i00 + g01 * i01 + g02 * i02
+            # rounding may take a variance below zero where noise differs by orders of magnitude inside one field
+            o[3] = max(g00 * i00 + g01 * i01 + g02 * i02, 1e-3 * t0 / (s0 * s0))
             o[4] = g00 * i01 + g01 * i11 + g02 * i12
             o[5] = g00 * i02 + g01 * i12 + g02 * i22
-            o[6] = g10 * i01 + g11 * i11 + g12 * i12
+            o[6] = max(g10 * i01 + g11 * i11 + g12 * i12, 0.0)
             o[7] = g10 * i02 + g11 * i12 + g12 * i22
-            o[8] = g20 * i02 + g21 * i12 + g22 * i22
+            o[8] = max(g20 * i02 + g21 * i12 + g22 * i22, 0.0)
             o[10] = n_effective
             o[11] = max(zz - o[0] * z0 - o[1] * z1 - o[2] * z2, 0.0)
             trace = g00 + g11 + g22

@@ -397,13 +397,14 @@ class LWPRSurface:
         memory = self._moved_memory(own)
         cells = own if memory is None else merge_cells([memory, own])
         level = self._refine(cells)
-        supported, _, noise = _support_at(own, level, self.own_kernel_)
+        supported, _, noise, nearby = _support_at(own, level, self.own_kernel_)
         own_support = Level(level.lattice, level.planes.copy())
         own_support.planes[6] = supported
         time = np.full(supported.shape, self.survey_time_)
         if memory is not None:
             remembered = _support_at(memory, level, self.memory_kernel_)
-            is_own = supported > 0.0
+            # at the rim of both, ground counts as seen by the epoch that has observations there
+            is_own = (supported > 0.0) | ((nearby > 0.0) & (remembered[0] == 0.0))
             supported = np.maximum(supported, remembered[0])
             time = np.where(is_own, time, remembered[1])
             noise = np.where(is_own, noise, remembered[2])

@@ -315,14 +315,15 @@ def support(cells: Cells, lattice: Lattice, kernel: float) -> FloatArray:
 
     Returns
     -------
-    judged : array, shape (3, n_rows, n_columns)
+    judged : array, shape (4, n_rows, n_columns)
         1 where there are enough observations on all sides, else 0; mean time of these observations, days; mean noise
-        variance of one of them, m2.
+        variance of one of them, m2; 1 where there are enough, if only on one side.
     """
     wide = Lattice(kernel, lattice.spacing, lattice.first_row, lattice.first_column, *lattice.shape)
     found = _walk_blocks(survey_support, cells, wide, np.zeros((*lattice.shape, 4)))
-    judged = np.empty((3, *lattice.shape))
-    judged[0] = (found[..., 0] >= N_MINIMUM) & (found[..., 1] <= CENTROID_LIMIT)
+    judged = np.empty((4, *lattice.shape))
+    judged[3] = found[..., 0] >= N_MINIMUM
+    judged[0] = (judged[3] > 0.0) & (found[..., 1] <= CENTROID_LIMIT)
     judged[1] = found[..., 2]
     judged[2] = found[..., 3]
     return judged

@@ -511,13 +511,16 @@ def _noise_prior(state: LWPRState, elevations: tuple[float, float, float], weigh
     """
     Pooled noise variance of all trusted fields.
 
-    Where no field holds residuals yet, the variance of the elevations themselves is all that bounds it.
+    It is their geometric mean, each weighted by what it knows: noise differs between places by factors, and a quiet
+    field must not take over the variance of noisy ones. Where no field holds residuals yet, the variance of the
+    elevations themselves is all that bounds it.
     """
     fields = state.fields[: state.n_fields]
-    fields = fields[(fields["trusted"] > 0.0) & (fields["Wcv"] > 0.0)]
     mass = fields["Wcv"] * (1.0 - fields["p"] / fields["W"])
     energy = np.where(fields["N"] > TRUST_COUNT, fields["Ecv_2"], fields["Ecv_1"])
-    if mass.sum() > 0.0:
-        return NoisePrior(float(energy.sum() / mass.sum()), weight)
+    is_known = (fields["trusted"] > 0.0) & (mass > 0.0) & (energy > 0.0)
+    if is_known.any():
+        mass, energy = mass[is_known], energy[is_known]
+        return NoisePrior(float(np.exp(np.average(np.log(energy / mass), weights=mass))), weight)
     count, _, squares = elevations
     return NoisePrior(squares / count if count else math.nan, weight)

@@ -185,7 +185,7 @@ def demo_programme(random_seed: int = DEMO_SEED, *, density: float = 9.0) -> Sim
     >>> [epoch.epoch_id for epoch in programme.epochs]
     ['2024-03-15', '2024-09-10', '2025-03-20']
     >>> round(programme.true_volume(0, 1).fill, 1)
-    158.7
+    153.6
     """
     scene = demo_scene(random_seed)
     west, _, south, _ = scene.region

@@ -247,7 +247,7 @@ def dem_scene(
 
 def coast_scene(random_seed: Seed, *, side: float = 120.0, corner: tuple[float, float] = _CORNER) -> Scene:
     """
-    Dunes behind a cliff that retreats twice, and a channel that silts up: directional ground and erosion.
+    Dunes over a cliff that retreats twice, and a channel: directional ground and erosion.
 
     Parameters
     ----------

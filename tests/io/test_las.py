@@ -114,9 +114,7 @@ def test_classes_that_are_not_there_are_refused_with_those_that_are(tmp_path: Pa
     path = tmp_path / "a.laz"
     write_las(path, PointCloud(*(np.full(12, v) for v in (634_000.0, 4_831_000.0, 1.0)), None, [1] * 5 + [5] * 7))
     source = open_points(path, SourceOptions(classes=(2, 9)))
-    with pytest.raises(
-        InputDataError, match=r"a\.laz: no usable point of class 2 or 9.* 1 \(5 points\), 5 \(7 points\)"
-    ):
+    with pytest.raises(InputDataError, match=r"a\.laz: no usable .* class 2 or 9.* 1 \(5 points\), 5 \(7 points\)"):
         source.read()
 
 
@@ -307,7 +305,7 @@ def test_random_damage_never_escapes_as_another_error(tmp_path: Path) -> None:
     whole, path = tmp_path / "whole.laz", tmp_path / "a.laz"
     write_points(whole, survey(200), "EPSG:26917")
     content = whole.read_bytes()
-    n_refused = 0
+    messages = []
     for trial in range(150):
         damaged = bytearray(content)
         for _ in range(4):
@@ -316,9 +314,9 @@ def test_random_damage_never_escapes_as_another_error(tmp_path: Path) -> None:
         try:
             read_points(path)
         except ChangeDetectError as error:
-            n_refused += 1
-            assert "a.laz" in str(error)
-    assert n_refused > 50
+            messages.append(str(error))
+    assert len(messages) > 50
+    assert all("a.laz" in message for message in messages)
 
 
 # writing
@@ -375,7 +373,7 @@ def test_nothing_is_written_for_no_points_or_no_crs(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(OutputError, match="Cannot write into .*file"):
+    with pytest.raises(OutputError, match=r"Cannot write into .*file"):
         write_points(tmp_path / "file" / "a.laz", survey(), "EPSG:26917")
 
 
