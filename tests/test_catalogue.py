@@ -237,15 +237,15 @@ def test_a_pair_goes_from_earlier_to_later(programme):
             programme.pair(earlier, later)
 
 
-def test_everything_of_a_new_programme_is_due_models_first(tmp_path):
+def test_everything_of_a_new_programme_is_due_in_the_order_it_is_made(tmp_path):
     surveys = {"2024-01-01": {}, "2024-02-01": {}, "2024-03-01": {}}
     items = plan(make_programme(tmp_path / "site", surveys))
     assert [(item.kind, item.item_id) for item in items] == [
         ("model", "2024-01-01"),
-        ("model", "2024-02-01"),
-        ("model", "2024-03-01"),
         ("epoch", "2024-01-01"),
+        ("model", "2024-02-01"),
         ("epoch", "2024-02-01"),
+        ("model", "2024-03-01"),
         ("epoch", "2024-03-01"),
         ("pair", "2024-01-01_2024-02-01"),
         ("pair", "2024-02-01_2024-03-01"),

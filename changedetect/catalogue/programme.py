@@ -262,7 +262,8 @@ class Programme:
 
     def existing_pairs(self) -> tuple[ChangeProduct, ...]:
         """Return the differences that have a folder in `products/`, of epochs the programme has."""
-        return tuple(pair for pair in self.pairs("all") if self.product_directory(pair.product_id).is_dir())
+        folders = {path.name for path in (self.directory / "products").glob("*") if path.is_dir()}
+        return tuple(pair for pair in self.pairs("all") if pair.product_id in folders)
 
 
 def _in_order(epochs: Sequence[Epoch]) -> tuple[Epoch, ...]:

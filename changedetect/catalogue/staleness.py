@@ -53,26 +53,30 @@ class Item:
     reasons: tuple[str, ...]
 
     @property
+    def title(self) -> str:
+        """What it is, for people."""
+        return {"model": "model of ", "epoch": "maps of ", "pair": "difference "}[self.kind] + self.item_id
+
+    @property
     def is_due(self) -> bool:
         """Whether it has to be made."""
         return bool(self.reasons)
 
 
 def plan(programme: Programme) -> tuple[Item, ...]:
-    """List models, epoch products and pair products in the order they are made, each with why it is due."""
-    models = []
+    """List model and maps of each epoch, then the differences, in the order they are made, each with why it is due."""
+    items = []
     states: dict[str, str] = {}
     parent: Epoch | None = None
     for epoch in programme.epochs:
         reasons = state_reasons(programme, epoch, parent, states)
-        models.append(Item("model", epoch.epoch_id, reasons))
         record = None if reasons else programme.state_record(epoch.epoch_id)
         states[epoch.epoch_id] = record[1] if record else _TO_BE_LEARNED
+        items.append(Item("model", epoch.epoch_id, reasons))
+        items.append(Item("epoch", epoch.epoch_id, epoch_product_reasons(programme, epoch.epoch_id, states)))
         parent = epoch
-    surfaces = [Item("epoch", name, epoch_product_reasons(programme, name, states)) for name in states]
     pairs = wanted_pairs(programme, list(states))
-    changes = [Item("pair", pair.product_id, pair_reasons(programme, pair, states)) for pair in pairs]
-    return (*models, *surfaces, *changes)
+    return (*items, *(Item("pair", pair.product_id, pair_reasons(programme, pair, states)) for pair in pairs))
 
 
 def wanted_pairs(programme: Programme, epoch_ids: Sequence[str]) -> tuple[ChangeProduct, ...]:

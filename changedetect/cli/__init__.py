@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         error.show()
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
-        return print_error(KeyboardInterrupt("interrupted"), INTERRUPTED, is_json=is_json)
+        return print_error(KeyboardInterrupt("Interrupted."), INTERRUPTED, is_json=is_json)
     except OSError as error:
         return print_error(error, INPUT_OUTPUT, is_json=is_json)
     except Exception as error:

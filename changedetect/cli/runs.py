@@ -82,7 +82,7 @@ def update(
         text.append("Nothing to do: all models and products are up to date.")
     text += _tables(programme)
     text += [f"Warning: {warning}" for warning in _product_warnings(programme)]
-    text += [f"Failed: {step['kind']} {step['id']}: {step['error']['message']}" for step in failed]
+    text += [f"Failed: {step['title']}: {step['error']['message']}" for step in failed]
     text.append(f"Maps lie in {directory / 'products'}")
     code = result.exit_code or (SIGNIFICANT_CHANGE if exit_code and is_changed else 0)
     return Outcome(document, text, code)
@@ -159,8 +159,7 @@ def _item(item: Item) -> dict[str, Any]:
 
 
 def _due_lines(due: list[Item]) -> list[RenderableType]:
-    kinds = {"model": "model of", "epoch": "maps of", "pair": "difference"}
-    return [f"To do: {kinds[item.kind]} {item.item_id}: {'; '.join(item.reasons)}" for item in due]
+    return [f"To do: {item.title}: {'; '.join(item.reasons)}" for item in due]
 
 
 def _is_changed(result: UpdateResult) -> bool:

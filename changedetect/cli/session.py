@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, get_type_hints
 import typer
 
 import changedetect
-from changedetect.typing import JSONObject
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from changedetect.catalogue import Programme
     from changedetect.pipeline.update import Progress
+    from changedetect.typing import JSONObject
 
 __all__ = ["COMMON_OPTIONS", "JSON_FORMAT_VERSION", "Outcome", "Session", "command", "print_error", "wants_json"]
 
@@ -155,7 +155,10 @@ def command(app: typer.Typer, name: str, prefix: str = "") -> Callable[[Callable
                 config_files=tuple(common["config"] or ()),
             )
             with _logging(session):
-                outcome = function(session, **values)
+                try:
+                    outcome = function(session, **values)
+                except KeyboardInterrupt as error:  # Typer would end with 130 and no word
+                    raise typer.Abort from error
             _print_outcome(session, outcome)
             return outcome.exit_code
 
@@ -206,7 +209,7 @@ def _print_outcome(session: Session, outcome: Outcome) -> None:
 
 def _print_json(document: JSONObject) -> None:
     head = {"format_version": JSON_FORMAT_VERSION, "software_version": changedetect.__version__}
-    text = json.dumps(head | document, indent=2, ensure_ascii=False, allow_nan=False, default=str)
+    text = json.dumps(head | document, indent=2, ensure_ascii=False, allow_nan=False)
     sys.stdout.write(text + "\n")
 
 

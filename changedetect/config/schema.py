@@ -63,7 +63,7 @@ class AdaptiveConfig:
     kernel_max_m: Annotated[float, Field(gt=0)] | None = None
     kernel_ratio: Annotated[float, Field(gt=1, lt=4)] = 1.4142
     lattice_spacing: Annotated[float, Field(gt=0, le=2)] = 0.8
-    shrinkage: Annotated[float, Field(ge=0)] = 0.7
+    shrinkage: Annotated[float, Field(ge=0)] = 1.0
     prior_observations: Annotated[float, Field(ge=0)] = 1.0
     outlier_threshold: Annotated[float, Field(ge=0)] = 6.0
 

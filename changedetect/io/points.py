@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 from changedetect.crs import is_geographic, make_transform
 from changedetect.errors import InputDataError, MissingInputError
 from changedetect.io.source import CHUNK_SIZE, PointSource, SourceOptions
-from changedetect.pointcloud import PointCloud, check_count, check_finite, check_not_degrees, check_values
+from changedetect.pointcloud import PointCloud, check_count, check_not_degrees, check_values
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -136,7 +136,6 @@ def iter_programme_chunks(
         transform = make_transform(source_crs, programme_crs, coordinate_epoch=coordinate_epoch)
     for chunk in source.iter_chunks(chunk_size):
         where = f"{source.path}, points from {n_points} on" if n_points else str(source.path)
-        check_finite(chunk, where)
         if n_points == 0 and not is_geographic(source_crs):
             check_not_degrees(chunk, where)
         with _naming(source.path):

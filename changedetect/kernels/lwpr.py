@@ -28,7 +28,7 @@ from changedetect.kernels.lwpr_search import (
     search_level,
 )
 from changedetect.kernels.lwpr_state import TINY, UPDATE_THRESHOLD, Parameters
-from changedetect.kernels.lwpr_update import count_sample, squared_reach, update_field
+from changedetect.kernels.lwpr_update import count_sample, squared_distance, squared_reach, update_field
 from changedetect.kernels.memory import prefetch
 from changedetect.kernels.neighbour_index import (
     VERSION,
@@ -195,6 +195,19 @@ def _learn_sample(
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _fetch_ahead(learner: _Learner, samples: _Samples, i: int, near: IntArray, n_near: int) -> None:
+    """Ask for the fields that a later sample will update, of which the geometry has been asked for before."""
+    if i < samples.x.shape[0]:
+        for j in range(n_near):
+            if squared_distance(learner.fields[near[j]], samples.x[i], samples.y[i]) <= learner.reach:
+                for line in range(1, 5):
+                    prefetch(learner.fields, near[j], line)
+                if learner.parameters.update_d:
+                    prefetch(learner.metrics, near[j], 0)
+                    prefetch(learner.metrics, near[j], 1)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def _learn_samples(learner: _Learner, samples: _Samples, start: int, trace: Trace) -> int:
     """
     Learn samples from number `start` on.
@@ -204,24 +217,28 @@ def _learn_samples(learner: _Learner, samples: _Samples, start: int, trace: Trac
     parameters, index, use_index = learner.parameters, learner.neighbours, learner.use_index
     level = search_level(parameters)
     n_samples, capacity = samples.x.shape[0], learner.fields.shape[0]
-    near, ahead = np.arange(capacity), np.arange(capacity)
+    near, ahead, far = np.arange(capacity), np.arange(capacity), np.arange(capacity)
     active = ActiveFields(np.empty(capacity, dtype=np.int64), np.empty(capacity), np.empty(capacity))
-    n_near, n_ahead = learner.counts[0], 0
-    if use_index and start < n_samples:
-        n_near = lookup(index, samples.x[start], samples.y[start], near)
+    n_near, n_ahead, n_far = learner.counts[0], 0, 0
+    near_version, ahead_version, far_version = -1, -1, -1
     for i in range(start, n_samples):
         x, y, target = samples.x[i], samples.y[i], samples.target[i]
+        if not use_index:
+            n_near = learner.counts[0]
+        elif near_version != index.counters[VERSION]:
+            n_near = lookup(index, x, y, near)
         n_active = active_fields(x, y, learner.fields, parameters.kernel, level, near, n_near, active)
         n_entries = n_active + 1 if parameters.update_d else 1
         if learner.counts[0] == capacity or (use_index and not has_room(index, n_entries)):
             return i
-        # look up the next sample now, so that its fields are on their way while this one is learned
-        version = index.counters[VERSION]
-        if use_index and i + 1 < n_samples:
-            n_ahead = lookup(index, samples.x[i + 1], samples.y[i + 1], ahead)
-            for j in range(n_ahead):
-                prefetch(learner.fields, ahead[j])
+        if use_index:
+            # later samples are looked up now, so that their fields are on their way while this one is learned
+            _fetch_ahead(learner, samples, i + 1, ahead, n_ahead)
             later = min(i + 2, n_samples - 1)
+            n_far, far_version = lookup(index, samples.x[later], samples.y[later], far), index.counters[VERSION]
+            for j in range(n_far):
+                prefetch(learner.fields, far[j], 0)
+            later = min(i + 3, n_samples - 1)
             prefetch_cells(index, samples.x[later], samples.y[later])
         prediction, first, second, w_max, w_second = _learn_sample(learner, x, y, target, active, n_active)
         if w_max <= parameters.w_gen:
@@ -232,12 +249,10 @@ def _learn_samples(learner: _Learner, samples: _Samples, start: int, trace: Trac
         trace.online_prediction[i] = prediction
         trace.largest_activation[i] = w_max
         trace.n_fields[i] = learner.counts[0]
-        if not use_index:
-            n_near = learner.counts[0]
-        elif i + 1 < n_samples:
-            if index.counters[VERSION] != version:
-                n_ahead = lookup(index, samples.x[i + 1], samples.y[i + 1], ahead)
-            near, ahead, n_near = ahead, near, n_ahead
+        if use_index:
+            near, ahead, far = ahead, far, near
+            n_near, n_ahead = n_ahead, n_far
+            near_version, ahead_version = ahead_version, far_version
     return n_samples
 
 

@@ -36,31 +36,31 @@ def aligned_records(capacity: int, dtype: np.dtype[np.void]) -> NDArray[np.void]
     return buffer[offset : offset + capacity * dtype.itemsize].view(dtype)
 
 
-def _prefetch_record(_typing_context: Any, records: Any, i: Any) -> Any:  # noqa: ARG001
+def _prefetch_line(_typing_context: Any, records: Any, i: Any, line: Any) -> Any:  # noqa: ARG001
     """
-    Ask for all cache lines of records[i] without waiting for them.
+    Ask for one cache line of records[i] without waiting for it.
 
     Random access to a large array is spent waiting for memory; asking one sample ahead hides that.
     """
-    signature = types.void(records, types.intp)
+    signature = types.void(records, types.intp, types.intp)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array_type = signature.args[0]
         array = context.make_array(array_type)(context, builder, arguments[0])
         element = _cgutils.get_item_pointer(context, builder, array_type, array, [arguments[1]])
         record = builder.bitcast(element, _cgutils.voidptr_t)
+        address = builder.gep(record, [builder.mul(arguments[2], _cgutils.intp_t(_LINE))])
         kind = _cgutils.ir.FunctionType(_cgutils.ir.VoidType(), [_cgutils.voidptr_t] + 3 * [_cgutils.int32_t])
         hint = _cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
         options = [_cgutils.int32_t(0), _cgutils.int32_t(3), _cgutils.int32_t(1)]  # for reading, all caches, data
-        for line in range(0, context.get_abi_sizeof(context.get_data_type(array_type.dtype)), _LINE):
-            builder.call(hint, [builder.gep(record, [_cgutils.intp_t(line)]), *options])
+        builder.call(hint, [address, *options])
         return context.get_dummy_value()
 
     return signature, generate
 
 
-def _no_prefetch(records: NDArray[Any], i: int) -> None:
+def _no_prefetch(records: NDArray[Any], i: int, line: int) -> None:
     """Do nothing: interpreted code has nothing to hint at."""
 
 
-prefetch: Any = _no_prefetch if _config.DISABLE_JIT else intrinsic(_prefetch_record)
+prefetch: Any = _no_prefetch if _config.DISABLE_JIT else intrinsic(_prefetch_line)

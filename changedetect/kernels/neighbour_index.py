@@ -2,8 +2,8 @@
 Index of ellipses in the plane: which ones may reach a point, in a time that does not grow with their number.
 
 Every ellipse is entered in all cells of a square grid that it (or its bounding box) touches, so a point looks up the
-one cell it lies in. Grids with cells of 2^level serve ellipses of different sizes; ellipses too large or too thin for
-any grid go to a list that every point visits. Cells are found by hashing, so empty ground costs nothing and there are
+one cell it lies in. Grids with cells of 2^level serve ellipses of different sizes; a few ellipses of odd sizes, and all
+that are too large or too thin for any grid, go to a list that every point visits. Cells are found by hashing, so empty ground costs nothing and there are
 no borders. A cell is one cache line and overflows into a chain of further ones.
 
 The index returns a superset of the ellipses that hold the point. Callers test each one themselves, hence it can never
@@ -47,13 +47,17 @@ _ENTRIES = 12
 #: Levels lie in 0 ... _N_LEVELS - 1, the typical ellipse at _MIDDLE; the last one is the list every point visits.
 _N_LEVELS = 48
 _MIDDLE = 24
-_UNBOUNDED = _N_LEVELS
+_EVERYWHERE = _N_LEVELS
 _NONE = -1
 _COORDINATE_MASK = (1 << 28) - 1
+#: So many ellipses of odd sizes are listed everywhere rather than on levels that every point would have to look up.
+_MAX_ODD = 36
 #: Beyond this ratio of the eigenvalues of a metric rounding could move the ellipse, so it is called unbounded.
 _MAX_CONDITION = 1e8
 #: An ellipse that may change is entered larger than it is by this factor, so that slow changes rarely cost anything.
 _MARGIN = 1.1
+#: It is entered on a finer level once it would fit there even if it were this much larger.
+_SHRINKAGE = 1.5
 
 _CELL_DTYPE = np.dtype([("key", np.int64), ("next", np.int32), ("count", np.int32), ("entries", np.int32, (_ENTRIES,))])
 
@@ -178,8 +182,8 @@ def insert(
     half_width, half_height = ellipse_extent(d_xx, d_xy, d_yy, reach)
     _set_box(index, entry, x, y, half_width, half_height)
     box = index.boxes[entry]
-    if box[0] == _UNBOUNDED:
-        _push(index, _pack(_UNBOUNDED, 0, 0), entry)
+    if box[0] == _EVERYWHERE:
+        _push(index, _pack(_EVERYWHERE, 0, 0), entry)
         return
     width, height = index.cell_size[box[0]]
     for row in range(box[3], box[4] + 1):
@@ -207,9 +211,12 @@ def update(
     box = index.boxes[entry]
     level = box[0]
     if level != _NONE:
-        if level == _level_for(index, _MARGIN * half_width, _MARGIN * half_height):
-            if level == _UNBOUNDED:
+        # a finer level only when well within it, or a metric that trembles would wander to and fro
+        wanted = _level_for(index, _SHRINKAGE * half_width, _SHRINKAGE * half_height)
+        if level == _EVERYWHERE:
+            if _is_odd(wanted):
                 return
+        elif level <= wanted:
             width, height = index.cell_size[level]
             if (
                 _cell(x - half_width, width) >= box[1]
@@ -259,8 +266,8 @@ def lookup(index: NeighbourIndex, x: float, y: float, found: IntArray) -> int:
         if index.level_count[level] > 0:
             column, row = _cell(x, index.cell_size[level, 0]), _cell(y, index.cell_size[level, 1])
             n_found = _append_list(index, _pack(level, column, row), found, n_found)
-    if index.level_count[_UNBOUNDED] > 0:
-        n_found = _append_list(index, _pack(_UNBOUNDED, 0, 0), found, n_found)
+    if index.level_count[_EVERYWHERE] > 0:
+        n_found = _append_list(index, _pack(_EVERYWHERE, 0, 0), found, n_found)
     return n_found
 
 
@@ -270,7 +277,7 @@ def prefetch_cells(index: NeighbourIndex, x: float, y: float) -> None:
     for level in range(index.counters[_LOWEST], index.counters[_HIGHEST] + 1):
         if index.level_count[level] > 0:
             column, row = _cell(x, index.cell_size[level, 0]), _cell(y, index.cell_size[level, 1])
-            prefetch(index.cells, _first_slot(index, _pack(level, column, row)))
+            prefetch(index.cells, _first_slot(index, _pack(level, column, row)), 0)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -309,7 +316,7 @@ def _level_for(index: NeighbourIndex, half_width: float, half_height: float) -> 
     width, height = index.cell_size[_MIDDLE]
     ratio = max(half_width / (half_cells * width), half_height / (half_cells * height))
     if not ratio < math.ldexp(1.0, _N_LEVELS - 1 - _MIDDLE):
-        return _UNBOUNDED
+        return _EVERYWHERE
     mantissa, exponent = math.frexp(ratio)
     # ratio = mantissa 2^exponent with mantissa in [0.5, 1): a power of two fits its own level, and with the slack so
     # does the typical ellipse, whatever its rounding; ENTRY_CELLS allows for it
@@ -319,13 +326,21 @@ def _level_for(index: NeighbourIndex, half_width: float, half_height: float) -> 
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def _is_odd(level: int) -> bool:
+    """Whether a level is neither that of the typical ellipse nor a neighbour of it."""
+    return abs(level - _MIDDLE) > 1
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def _set_box(index: NeighbourIndex, entry: int, x: float, y: float, half_width: float, half_height: float) -> None:
     """Choose the level of an entry and the cells of its box, and count it; the caller fills the cells."""
     level = _level_for(index, half_width, half_height)
+    if _is_odd(level) and index.level_count[_EVERYWHERE] < _MAX_ODD:
+        level = _EVERYWHERE
     box = index.boxes[entry]
     box[0] = level
     box[1:] = 0
-    if level != _UNBOUNDED:
+    if level != _EVERYWHERE:
         width, height = index.cell_size[level]
         # far from the origin the differences below are rounded by more than the slack of the extent
         half_width += 1e-15 * abs(x)

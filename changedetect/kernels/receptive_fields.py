@@ -19,7 +19,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-__all__ = ["N_FIT", "N_PLANE", "blend_planes", "fit_planes", "shrink_planes"]
+__all__ = ["N_FIT", "N_PLANE", "blend_planes", "fit_planes", "plane_information", "pool_noise", "shrink_planes", "survey_support"]
 
 #: Columns of `fit_planes`: 0 value, 1 slope east * h, 2 slope north * h, 3-8 covariance of these (00 01 02 11 12 22),
 #: 9 sum of weights, 10 effective number of observations, 11 weighted residual sum, 12 its expectation under the noise variances stated,
@@ -167,26 +167,45 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
             o[15] = s0 / count
 
 
-@njit(cache=True, error_model="numpy")
-def _information(o):
-    """beta' C^-1 beta of one fit: how many noise standard deviations, squared, its plane is away from zero."""
-    a, b, c, d, e, f = o[3], o[4], o[5], o[6], o[7], o[8]
-    c00 = d * f - e * e
-    c01 = c * e - b * f
-    c02 = b * e - c * d
-    det = a * c00 + b * c01 + c * c02
-    if not det > 0.0:
-        return 0.0
-    c11 = a * f - c * c
-    c12 = b * c - a * e
-    c22 = a * d - b * b
-    x, y, z = o[0], o[1], o[2]
-    q = x * x * c00 + y * y * c11 + z * z * c22 + 2.0 * (x * y * c01 + x * z * c02 + y * z * c12)
-    return max(q / det, 0.0)
+@njit(cache=True, parallel=True, error_model="numpy")
+def plane_information(fits, n_minimum, limit, information):
+    """
+    How many noise standard deviations, squared, each plane is away from zero: beta' C^-1 beta.
+
+    Parameters
+    ----------
+    fits : array, shape (n_i, n_j, N_FIT)
+    n_minimum : float
+        Effective number of observations a field needs.
+    limit : float
+        Larger values are cut off: beyond it a plane is kept whole in any case, and must not sway its neighbours.
+    information : array, shape (n_i, n_j)
+        Filled in place; -1 where a field has too few observations.
+    """
+    for i in prange(fits.shape[0]):
+        for j in range(fits.shape[1]):
+            o = fits[i, j]
+            information[i, j] = -1.0
+            if not (o[9] > 0.0 and o[10] >= n_minimum):
+                continue
+            a, b, c, d, e, f = o[3], o[4], o[5], o[6], o[7], o[8]
+            c00 = d * f - e * e
+            c01 = c * e - b * f
+            c02 = b * e - c * d
+            det = a * c00 + b * c01 + c * c02
+            if not det > 0.0:
+                information[i, j] = 0.0
+                continue
+            c11 = a * f - c * c
+            c12 = b * c - a * e
+            c22 = a * d - b * b
+            x, y, z = o[0], o[1], o[2]
+            q = x * x * c00 + y * y * c11 + z * z * c22 + 2.0 * (x * y * c01 + x * z * c02 + y * z * c12)
+            information[i, j] = min(max(q / det, 0.0), limit)
 
 
-@njit(cache=True, error_model="numpy")
-def shrink_planes(fits, base, detail, kernel, n_minimum, shrinkage, planes):
+@njit(cache=True, parallel=True, error_model="numpy")
+def shrink_planes(fits, base, information, detail, kernel, shrinkage, planes):
     """
     Planes of one level: what the coarser levels left over, shrunk.
 
@@ -196,12 +215,12 @@ def shrink_planes(fits, base, detail, kernel, n_minimum, shrinkage, planes):
         Local planes of the residuals.
     base : array, shape (2, n_i, n_j)
         Variance of the coarser levels' sum at the centres, and whether it is defined (1 or 0).
+    information : array, shape (n_i, n_j)
+        `plane_information`, averaged over the neighbourhood; negative where a field has too few observations.
     detail : array, shape (n_i, n_j), m2
         Typical variance of what this level adds around there; enters the variance where the data of a field cannot
         tell.
     kernel : float, m
-    n_minimum : float
-        Effective number of observations a field needs.
     shrinkage : float
         Strength c of the shrinkage; 0 takes every plane as fitted.
     planes : array, shape (N_PLANE, n_i, n_j)
@@ -209,42 +228,28 @@ def shrink_planes(fits, base, detail, kernel, n_minimum, shrinkage, planes):
 
     Notes
     -----
-    Empirical Bayes, James-Stein form: s = max(0, 1 - 3 c / q), q = beta' C^-1 beta averaged with the eight
-    neighbours, whose data overlap. The coarse estimate and this level's share their data, so with v the variance
-    of the coarse surface and C that of the unshrunk fine one the combination has variance (1 - s) v + s C; detail that
-    the field cannot see, of prior variance t, adds t A / (t + A) (1 - s) with A = C - v.
+    Empirical Bayes, James-Stein form: s = max(0, 1 - 3 c / q) with q the information. The coarse estimate and this
+    level's share their data, so with v the variance of the coarse surface and C that of the unshrunk fine one the
+    combination has variance (1 - s) v + s C; detail that the field cannot see, of prior variance t, adds
+    t A / (t + A) (1 - s) with A = C - v.
     """
-    n_i, n_j = fits.shape[0], fits.shape[1]
-    information = np.full((n_i, n_j), -1.0)
-    for i in range(n_i):
-        for j in range(n_j):
-            if fits[i, j, 9] > 0.0 and fits[i, j, 10] >= n_minimum:
-                information[i, j] = min(_information(fits[i, j]), 1e4)
-    for i in range(n_i):
-        for j in range(n_j):
+    for i in prange(fits.shape[0]):
+        for j in range(fits.shape[1]):
             o = fits[i, j]
             is_based = base[1, i, j] > 0.0
+            is_fitted = information[i, j] >= 0.0
             v = base[0, i, j] if is_based else 0.0
             s = 0.0
             added = detail[i, j]
-            if information[i, j] >= 0.0:
-                if is_based:
-                    total = weight = 0.0
-                    for a in range(max(0, i - 1), min(n_i, i + 2)):
-                        for b in range(max(0, j - 1), min(n_j, j + 2)):
-                            if information[a, b] >= 0.0:
-                                w = 1.0 if (a == i and b == j) else (0.36 if (a == i or b == j) else 0.13)
-                                total += w * information[a, b]
-                                weight += w
-                    q = total / weight
-                    s = max(0.0, 1.0 - 3.0 * shrinkage / max(q, 1e-12)) if shrinkage > 0.0 else 1.0
-                else:
-                    s = 1.0
+            if is_fitted:
+                s = 1.0
+                if is_based and shrinkage > 0.0:
+                    s = max(0.0, 1.0 - 3.0 * shrinkage / max(information[i, j], 1e-12))
                 unseen = max(o[3] - v, 0.0)
                 t = detail[i, j]
                 added = t * unseen / (t + unseen) * (1.0 - s) if t + unseen > 0.0 else 0.0
             planes[8, i, j] = s
-            if not is_based and s == 0.0:
+            if not is_based and not is_fitted:
                 planes[4, i, j] = 0.0
                 continue
             planes[0, i, j] = s * o[0]
@@ -252,7 +257,7 @@ def shrink_planes(fits, base, detail, kernel, n_minimum, shrinkage, planes):
             planes[2, i, j] = s * o[2] / kernel
             planes[3, i, j] = (1.0 - s) * v + s * o[3] + added
             gamma = detail[i, j] + 1e-8
-            if information[i, j] >= 0.0:
+            if is_fitted:
                 left = (1.0 - s) * (1.0 - s) * (o[0] * o[0] + 0.25 * (o[1] * o[1] + o[2] * o[2]))
                 gamma = o[11] / max(o[12] * o[15], 0.3 * o[9]) + left + 1e-8
             elif o[9] > 0.0:

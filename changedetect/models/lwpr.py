@@ -29,6 +29,9 @@ __all__ = ["LWPRSurface", "check_observations", "point_density"]
 
 #: Finest kernel in mean point spacings: about nine observations, effectively, in a receptive field.
 _FINEST_KERNEL = 1.16
+#: The pyramid goes half an octave below the kernel that the density supports on average: where there is detail the
+#: shrinkage keeps it.
+_FINEST_LEVEL = 2.0**-0.5
 #: Levels of the pyramid where no coarsest kernel is set: ten, a factor of 22 in kernel size.
 _N_STEPS = 9
 #: Shrinkage of what a new epoch changes in the memory; stronger than the surface's, since most ground stays.
@@ -328,7 +331,7 @@ class LWPRSurface:
     def _inherit(self, parent: Self | None) -> None:
         """Take over the memory and the kernel bank of the epoch before."""
         self.__dict__.pop("_built", None)
-        finest = self.own_kernel_
+        finest = self.own_kernel_ * _FINEST_LEVEL
         self.memory_: Cells | None = None
         self.memory_kernel_ = self.own_kernel_
         if parent is not None:

@@ -14,6 +14,7 @@ from changedetect.kernels.receptive_fields import (
     N_PLANE,
     blend_planes,
     fit_planes,
+    plane_information,
     pool_noise,
     shrink_planes,
     survey_support,
@@ -39,6 +40,10 @@ CENTROID_LIMIT = 0.75
 NOISE_REACH = 3
 #: Lattice steps over which the typical detail of a level is averaged.
 _DETAIL_REACH = 6.0
+#: Lattice steps over which the evidence for detail is pooled. Alone, one field in three keeps a fifth of pure noise;
+#: of 0.7, 1.2 and 2.0 the last had the least error on dense and on sparse data.
+_INFORMATION_REACH = 2.0
+_INFORMATION_LIMIT = 300.0
 #: Receptive fields along one edge of a block of work; bounds memory and changes no result.
 _BLOCK_FIELDS = 512
 
@@ -228,6 +233,16 @@ def _detail_variance(fits: FloatArray, base: FloatArray) -> FloatArray:
     return local
 
 
+def _pooled_information(fits: FloatArray) -> FloatArray:
+    """Information of each field's plane, averaged with its neighbours'; -1 where a field has too few observations."""
+    information = np.empty(fits.shape[:2])
+    plane_information(fits, N_MINIMUM, _INFORMATION_LIMIT, information)
+    fitted = information >= 0.0
+    mass = gaussian_filter(fitted.astype(np.float64), _INFORMATION_REACH, truncate=2.5, mode="constant")
+    total = gaussian_filter(np.where(fitted, information, 0.0), _INFORMATION_REACH, truncate=2.5, mode="constant")
+    return np.where(fitted, total / np.where(fitted, mass, 1.0), -1.0)
+
+
 def build_level(cells: Cells, lattice: Lattice, shrinkage: float, coarser: Level | None) -> Level:
     """
     Receptive fields of one kernel size on what the coarser levels left over.
@@ -254,7 +269,8 @@ def build_level(cells: Cells, lattice: Lattice, shrinkage: float, coarser: Level
         base[1] = at_centres[:, 7].reshape(lattice.shape)
     fits = fit_lattice(cells, lattice)
     planes = np.zeros((N_PLANE, *lattice.shape))
-    shrink_planes(fits, base, _detail_variance(fits, base), lattice.kernel, N_MINIMUM, shrinkage, planes)
+    information = _pooled_information(fits)
+    shrink_planes(fits, base, information, _detail_variance(fits, base), lattice.kernel, shrinkage, planes)
     return Level(lattice, planes, _LEVEL_REACH)
 
 

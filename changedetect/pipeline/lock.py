@@ -54,5 +54,7 @@ def programme_lock(directory: Path) -> Iterator[None]:
         for folder in ("state", "products", "epochs", "runs", "sources"):
             if (directory / folder).is_dir():
                 clear_leftovers(directory / folder)
-        yield
-        stream.truncate(0)
+        try:
+            yield
+        finally:
+            stream.truncate(0)

@@ -137,7 +137,8 @@ class RunManifest:
             To be filled with what the step found.
         """
         details: dict[str, Any] = {}
-        entry: JSONObject = {"kind": item.kind, "id": item.item_id, "reasons": list(item.reasons), "status": "made"}
+        entry: JSONObject = {"kind": item.kind, "id": item.item_id, "title": item.title, "status": "made"}
+        entry["reasons"] = list(item.reasons)
         started = perf_counter()
         context = _log_context.set({**log_context(), "epoch": item.item_id})
         try:
@@ -146,7 +147,7 @@ class RunManifest:
             entry["status"] = "failed"
             entry["error"] = self._fail(error)
             is_bug = not isinstance(error, ChangeDetectError)
-            logger.error("%s %s: %s", _KIND_NAMES[item.kind], item.item_id, error, exc_info=is_bug)
+            logger.error("%s: %s", item.title, error, exc_info=is_bug)
         finally:
             _log_context.reset(context)
         entry |= {"seconds": round(perf_counter() - started, 3), **details}
@@ -181,9 +182,6 @@ class RunManifest:
     def to_json(self) -> Mapping[str, Any]:
         """Return the record as it stands on disk."""
         return self._document
-
-
-_KIND_NAMES = {"model": "model of", "epoch": "products of", "pair": "difference"}
 
 
 def _close_killed_run(programme: Programme) -> None:

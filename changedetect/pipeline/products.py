@@ -26,7 +26,7 @@ from changedetect.pipeline.colours import change_limits, programme_limits, surfa
 from changedetect.pipeline.learn import ModelShelf
 from changedetect.pipeline.manifest import utc_now
 from changedetect.pipeline.regions import join_regions
-from changedetect.storage import write_json
+from changedetect.storage import read_json, write_json
 from changedetect.typing import FloatArray, JSONObject, Region
 
 __all__ = [
@@ -181,7 +181,7 @@ def make_pair_products(
         "n_files": len(files),
         "shape": list(grid.shape),
         "warnings": list(warnings),
-        "summary": summary,
+        "summary": read_json(folder / SUMMARY_FILE),
     }
 
 

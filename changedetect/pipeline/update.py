@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
 import numba
 
 from changedetect.catalogue import (
+    ChangeProduct,
     Epoch,
     Item,
     Programme,
@@ -123,43 +125,51 @@ class _Update:
         self._states: dict[str, str] = {}
 
     def execute(self) -> None:
-        """Learn, then make products of epochs, then of pairs."""
-        self._learn_epochs()
-        programme, run_id = self.programme, self.run.run_id
-        for epoch_id in self._states:
-            if reasons := epoch_product_reasons(programme, epoch_id, self._states):
-                with self._step(Item("epoch", epoch_id, reasons)) as details:
-                    details.update(make_epoch_products(programme, epoch_id, self.models, run_id))
-        for pair in wanted_pairs(programme, list(self._states)):
-            if reasons := pair_reasons(programme, pair, self._states):
-                with self._step(Item("pair", pair.product_id, reasons)) as details:
-                    details.update(make_pair_products(programme, pair, self.models, run_id))
-                    for warning in details["warnings"]:
-                        self.run.warn(f"{pair.earlier} to {pair.later}: {warning}")
+        """Make what is due: the model and the maps of each epoch in order of time, then the differences."""
+        parent: Epoch | None = None
+        for epoch in self.programme.epochs:
+            # the maps follow at once, while the model's receptive fields are in memory; the next epoch needs them too
+            if self._is_learned(epoch, parent):
+                parent = epoch
+                self._make_epoch_products(epoch.epoch_id)
+        for pair in wanted_pairs(self.programme, list(self._states)):
+            self._make_pair_products(pair)
         if self._on_progress is not None:
             self._on_progress(self._total, self._total, "done")
 
-    def _learn_epochs(self) -> None:
-        """Learn what is due; an epoch that fails is passed over, and the next one follows its predecessor."""
-        parent: Epoch | None = None
-        for epoch in self.programme.epochs:
-            reasons = state_reasons(self.programme, epoch, parent, self._states)
-            if reasons:
-                with self._step(Item("model", epoch.epoch_id, reasons)) as details:
-                    details.update(learn_epoch(self.programme, epoch, parent, self.models))
-                if self.run.steps[-1]["status"] == "failed":
-                    continue
-            record = self.programme.state_record(epoch.epoch_id)
-            if record is not None:
-                self._states[epoch.epoch_id] = record[1]
-                parent = epoch
+    def _is_learned(self, epoch: Epoch, parent: Epoch | None) -> bool:
+        """Learn an epoch if it is due; one that fails is passed over, and the next follows its predecessor."""
+        reasons = state_reasons(self.programme, epoch, parent, self._states)
+        if reasons:
+            with self._step(Item("model", epoch.epoch_id, reasons)) as details:
+                details.update(learn_epoch(self.programme, epoch, parent, self.models))
+            if self.run.steps[-1]["status"] == "failed":
+                return False
+        record = self.programme.state_record(epoch.epoch_id)
+        if record is None:
+            return False
+        self._states[epoch.epoch_id] = record[1]
+        return True
 
-    def _step(self, item: Item) -> Any:
-        logger.info("%s %s: %s", item.kind, item.item_id, "; ".join(item.reasons))
+    def _make_epoch_products(self, epoch_id: str) -> None:
+        reasons = epoch_product_reasons(self.programme, epoch_id, self._states)
+        if reasons:
+            with self._step(Item("epoch", epoch_id, reasons)) as details:
+                details.update(make_epoch_products(self.programme, epoch_id, self.models, self.run.run_id))
+
+    def _make_pair_products(self, pair: ChangeProduct) -> None:
+        reasons = pair_reasons(self.programme, pair, self._states)
+        if reasons:
+            with self._step(Item("pair", pair.product_id, reasons)) as details:
+                details.update(make_pair_products(self.programme, pair, self.models, self.run.run_id))
+                for warning in details["warnings"]:
+                    self.run.warn(f"{pair.earlier} to {pair.later}: {warning}")
+
+    def _step(self, item: Item) -> AbstractContextManager[dict[str, Any]]:
+        logger.info("%s: %s", item.title, "; ".join(item.reasons))
         if self._on_progress is not None:
-            self._on_progress(
-                len(self.run.steps), max(self._total, len(self.run.steps) + 1), f"{item.kind} {item.item_id}"
-            )
+            done = len(self.run.steps)
+            self._on_progress(done, max(self._total, done + 1), item.title)
         return self.run.step(item)
 
 

@@ -97,7 +97,7 @@ def test_a_failed_epoch_gives_its_exit_code_and_is_told(tmp_path, capsys):
     (programme.directory / "inputs" / f"{SECOND}.laz").write_bytes(b"no LAS file")
     assert main(["update", str(programme.directory)]) == 65
     captured = capsys.readouterr()
-    assert f"Failed: model {SECOND}:" in captured.out
+    assert f"Failed: model of {SECOND}:" in captured.out
     assert "is not a LAS or LAZ file" in captured.err
     document = run(capsys, "update", programme.directory, expect=65)
     assert document["steps"][0]["error"]["class"] == "InputDataError"

@@ -266,6 +266,14 @@ def test_nan_in_a_source_is_refused(tmp_path: Path) -> None:
         first_chunk(path, "EPSG:32632", crs="EPSG:32632")
 
 
+@pytest.mark.parametrize("word", ["nan", "inf"])
+def test_coordinates_that_are_not_finite_do_not_pass_through_a_transformation(tmp_path: Path, word: str) -> None:
+    path = write_all(tmp_path)["ply"]
+    path.write_text(path.read_text().replace("500003.0 ", f"{word} "))
+    with pytest.raises(InputDataError, match=r"1 of 40 points have no finite easting .* first at point 3"):
+        first_chunk(path, "EPSG:32632", crs="EPSG:32633")
+
+
 def test_degrees_stated_to_be_metres_are_recognised(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("x,y,z\n" + "".join(f"{9 + i * 1e-5},{48 + i * 1e-5},400\n" for i in range(20)))

@@ -102,20 +102,35 @@ def test_pooled_noise_ignores_a_minority_of_rough_fields():
     np.testing.assert_allclose(pooled[:, :5], 0.01, rtol=0.35, atol=0.0)
 
 
-def test_pure_noise_is_shrunk_to_the_coarser_surface():
-    rng = np.random.default_rng(4)
-    fits = np.zeros((20, 20, kernel.N_FIT))
-    fits[..., 0:3] = rng.normal(0.0, 0.1, (20, 20, 3))
-    fits[..., 3] = fits[..., 6] = fits[..., 8] = 0.01
+def test_information_is_the_squared_distance_from_zero_in_standard_deviations():
+    fits = np.zeros((1, 2, kernel.N_FIT))
+    covariance = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.2], [-0.1, 0.2, 0.5]])
+    beta = np.array([1.0, -2.0, 0.5])
+    fits[0, 0, :3], fits[0, 0, 3:9] = beta, covariance[np.triu_indices(3)]
+    fits[0, 0, 9] = fits[0, 0, 10] = 10.0
+    information = np.empty((1, 2))
+    kernel.plane_information(fits, 4.0, 1e9, information)
+    np.testing.assert_allclose(information[0, 0], beta @ np.linalg.solve(covariance, beta), rtol=1e-12, atol=0.0)
+    assert information[0, 1] == -1.0
+
+
+def test_planes_are_shrunk_by_their_information():
+    fits = np.zeros((1, 3, kernel.N_FIT))
+    fits[..., 0], fits[..., 3] = 0.4, 0.01
     fits[..., 9] = fits[..., 10] = fits[..., 12] = 20.0
     fits[..., 11], fits[..., 15] = 20.0, 100.0
-    base = np.zeros((2, 20, 20))
-    base[0], base[1] = 0.001, 1.0
-    planes = np.zeros((kernel.N_PLANE, 20, 20))
-    kernel.shrink_planes(fits, base, np.zeros((20, 20)), 1.0, 4.0, 1.0, planes)
-    assert planes[8].mean() < 0.25
-    assert np.std(planes[0]) < 0.05
-    fits[..., 0] += 5.0
-    kernel.shrink_planes(fits, base, np.zeros((20, 20)), 1.0, 4.0, 1.0, planes)
-    np.testing.assert_allclose(planes[0].mean(), 5.0, rtol=0.01, atol=0.0)
-    np.testing.assert_allclose(planes[3], 0.01, rtol=0.02, atol=0.0)
+    base = np.stack([np.full((1, 3), 0.001), np.ones((1, 3))])
+    planes = np.zeros((kernel.N_PLANE, 1, 3))
+    information = np.array([[2.0, 6.0, 3000.0]])
+    kernel.shrink_planes(fits, base, information, np.zeros((1, 3)), 1.0, 1.0, planes)
+    np.testing.assert_allclose(planes[8, 0], [0.0, 0.5, 0.999], rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(planes[0, 0], [0.0, 0.2, 0.3996], rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(planes[3, 0], [0.001, 0.0055, 0.009991], rtol=1e-12, atol=0.0)
+
+
+def test_unseen_detail_adds_to_the_variance():
+    fits = np.zeros((1, 1, kernel.N_FIT))
+    base = np.stack([np.full((1, 1), 0.001), np.ones((1, 1))])
+    planes = np.zeros((kernel.N_PLANE, 1, 1))
+    kernel.shrink_planes(fits, base, np.full((1, 1), -1.0), np.full((1, 1), 0.04), 1.0, 1.0, planes)
+    np.testing.assert_allclose(planes[3, 0, 0], 0.041, rtol=1e-12, atol=0.0)

@@ -238,13 +238,13 @@ class PointModel(ABC, Generic[Prepared]):
             model.parameters_ = {name: float.fromhex(value) for name, value in parameters.items()}
             time = float.fromhex(dataset.attrs["survey_time"])
             points = np.stack([dataset[name].values for name in ("easting", "northing", "elevation", "variance")])
+            model._observations = observations_from(points)
+            with _one_thread():
+                model._prepared = model._prepare(model._observations, model.parameters_)
         except (KeyError, TypeError, ValueError) as error:
             msg = f"{path} is not a whole {cls.__name__}: {error}. Fit the model again and save it."
             raise ModelStateError(msg) from error
         model._points, model._survey_time = points, time
-        model._observations = observations_from(points)
-        with _one_thread():
-            model._prepared = model._prepare(model._observations, model.parameters_)
         return model
 
     def _learn(self, points: FloatArray, survey_time: float) -> None:
@@ -310,7 +310,7 @@ def _prediction(layers: FloatArray, datum: float) -> Prediction:
 def _require_kind(dataset: xr.Dataset, model: str, path: Path) -> None:
     version, kind = dataset.attrs.get("format_version"), dataset.attrs.get("model")
     if version != _FORMAT_VERSION:
-        msg = f"{path} has format version {version!r}; this version reads {_FORMAT_VERSION}. Fit the model again."
+        msg = f"{path} has format version {version}; this version reads {_FORMAT_VERSION}. Fit the model again."
         raise ModelStateError(msg)
     if kind != model:
         msg = f"{path} holds a {kind!r}, not a {model!r}. Load it with the class that saved it."

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from changedetect.models.comparators.base import LocalAnswer
-from changedetect.models.comparators.observations import Observations, nearest
+from changedetect.models.comparators.observations import Observations, distance_to_kth, nearest
 
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray
@@ -23,6 +23,7 @@ __all__ = [
     "estimate_covariance",
     "likelihood_blocks",
     "negative_log_likelihood",
+    "parameter_ranges",
 ]
 
 Kernel: TypeAlias = Literal["rbf", "matern32"]
@@ -30,8 +31,8 @@ Kernel: TypeAlias = Literal["rbf", "matern32"]
 _SQRT3 = float(np.sqrt(3.0))
 #: Added to the diagonal, relative to the signal: smooth covariances of close points are singular to rounding.
 _JITTER = 1e-9
-#: Where the observations leave more than this part of the prior variance they are taken to say nothing.
-_UNSUPPORTED_SHARE = 0.999
+#: Scaled distance at which the correlation has fallen to 0.05.
+_EFFECTIVE_RANGE: dict[Kernel, float] = {"rbf": float(np.sqrt(2.0 * np.log(20.0))), "matern32": 2.7389}
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,11 @@ class Covariance:
         """Variance of one typical observation about the surface, m2."""
         return self.nugget + self.mean_variance
 
+    @property
+    def effective_range(self) -> float:
+        """Distance at which the correlation has fallen to 0.05, m: an observation says nothing beyond it."""
+        return _EFFECTIVE_RANGE[self.kernel] * self.length_scale
+
     def between(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Covariance of the surface at two sets of positions, shapes (n, 2) and (m, 2), as (n, m), m2."""
         return self.at_distance(cdist(first, second))
@@ -98,6 +104,29 @@ def _correlation_slope(kernel: Kernel, scaled_distance: FloatArray) -> FloatArra
         return np.asarray(scaled_distance**2 * np.exp(-0.5 * scaled_distance**2))
     a = _SQRT3 * scaled_distance
     return np.asarray(a**2 * np.exp(-a))
+
+
+def parameter_ranges(observations: Observations) -> list[tuple[float, float]]:
+    """
+    Bounds within which signal variance (m2), length scale (m) and nugget (m2) are sought.
+
+    Raises
+    ------
+    ValueError
+        All points lie at one place.
+
+    Notes
+    -----
+    Lengths below half the distance to the fourth neighbour cannot be told from noise; lengths of more than twice the
+    site, or signals much larger than the relief, turn flat ground into far extrapolation.
+    """
+    extent = float(max(np.ptp(observations.easting), np.ptp(observations.northing)))
+    if extent == 0.0:
+        msg = "All points lie at one place; a covariance cannot be fitted."
+        raise ValueError(msg)
+    shortest = min(0.5 * distance_to_kth(observations.positions, 4), extent)
+    relief = max(float(observations.elevation.var()), 1e-8)
+    return [(1e-4 * relief, 100.0 * relief), (shortest, 2.0 * extent), (1e-7 * relief, 10.0 * relief)]
 
 
 def likelihood_blocks(
@@ -214,18 +243,13 @@ def estimate_covariance(
     ValueError
         All points lie at one place.
     """
+    ranges = parameter_ranges(observations)
     rng = np.random.default_rng(random_seed)
     blocks = likelihood_blocks(observations, rng, n_blocks=n_blocks, block_size=block_size)
-    extent = float(max(np.ptp(observations.easting), np.ptp(observations.northing)))
-    if extent == 0.0:
-        msg = "All points lie at one place; a covariance cannot be fitted."
-        raise ValueError(msg)
-    spacing = extent / np.sqrt(len(observations))
-    relief = max(float(observations.elevation.var()), 1e-8)
-    # wider bounds let flat ground run away to lengths at which everything is extrapolation
-    ranges = [(1e-4 * relief, 100.0 * relief), (0.2 * spacing, 2.0 * extent), (1e-8 * relief, 10.0 * relief)]
     bounds = Bounds(*np.log(ranges).T)
-    starts = [(relief, scale, 0.05 * relief) for scale in (4.0 * spacing, np.sqrt(spacing * extent), 0.3 * extent)]
+    relief, (shortest, longest) = 0.01 * ranges[0][1], ranges[1]
+    scales = (4.0 * shortest, np.sqrt(shortest * longest), 0.1 * longest)
+    starts = [(relief, scale, 0.05 * relief) for scale in scales]
     fits = [
         minimize(
             negative_log_likelihood,
@@ -242,7 +266,14 @@ def estimate_covariance(
     return Covariance(kernel, float(signal), float(length), float(nugget), float(observations.variance.mean()))
 
 
-def answer_from_moments(covariance: Covariance, elevation: FloatArray, variance: FloatArray) -> LocalAnswer:
+def answer_from_moments(
+    covariance: Covariance,
+    elevation: FloatArray,
+    variance: FloatArray,
+    distance: FloatArray,
+    *,
+    is_mean_known: bool = True,
+) -> LocalAnswer:
     """
     Turn a posterior mean and variance of the surface into an answer.
 
@@ -252,6 +283,10 @@ def answer_from_moments(covariance: Covariance, elevation: FloatArray, variance:
     elevation : array, shape (n,), m
     variance : array, shape (n,), m2
         Posterior variance of the surface, without noise.
+    distance : array, shape (n,), m
+        From each place to the nearest observation.
+    is_mean_known : bool
+        Whether the prior has a variance at all; with an unknown mean, as in ordinary kriging, it is infinite.
 
     Returns
     -------
@@ -260,16 +295,16 @@ def answer_from_moments(covariance: Covariance, elevation: FloatArray, variance:
     Notes
     -----
     The effective number of observations is that of independent ones at the place itself which would reduce the prior
-    variance p to the posterior v: noise / v - noise / p. Where v exceeds 99.9 % of p the observations say nothing; a
-    Gaussian process answers with its mean there, which is no knowledge about the ground, and the number is set to 0.
+    variance p to the posterior v: noise / v - noise / p. Beyond the effective range of the covariance from all
+    observations a Gaussian process answers with its mean, which is no knowledge about the ground; the number is 0.
     """
-    prior = covariance.signal_variance
-    floor = 1e-9 * prior
-    posterior = np.maximum(variance, floor)
-    n_effective = covariance.noise_variance * np.maximum(1.0 / posterior - 1.0 / prior, 0.0)
+    posterior = np.maximum(variance, 1e-9 * covariance.signal_variance)
+    prior_precision = 1.0 / covariance.signal_variance if is_mean_known else 0.0
+    # the floor keeps rounding from turning a weak answer into none
+    n_effective = np.maximum(covariance.noise_variance * (1.0 / posterior - prior_precision), 1e-6)
     return LocalAnswer(
         elevation=elevation,
         elevation_std=np.sqrt(posterior),
         noise_std=np.full(elevation.shape, np.sqrt(covariance.noise_variance)),
-        n_effective=np.where(posterior < _UNSUPPORTED_SHARE * prior, n_effective, 0.0),
+        n_effective=np.where(distance <= covariance.effective_range, n_effective, 0.0),
     )

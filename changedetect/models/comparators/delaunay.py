@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 __all__ = ["DelaunayLinear"]
 
+#: Noise is taken to be at least this, m: data without any would have infinite weights.
+_LEAST_NOISE = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
@@ -70,7 +73,7 @@ class DelaunayLinear(PointModel[_Prepared]):
             )
             raise ValueError(msg)
         # 1.4826 times the median of absolute normal deviates is their standard deviation
-        return {"noise_std": 1.4826 * float(np.median(inside))}
+        return {"noise_std": max(1.4826 * float(np.median(inside)), _LEAST_NOISE)}
 
     def _prepare(self, observations: Observations, parameters: dict[str, float]) -> _Prepared:
         noise_std = parameters["noise_std"]
@@ -81,13 +84,11 @@ class DelaunayLinear(PointModel[_Prepared]):
     def _answer(self, prepared: _Prepared, easting: FloatArray, northing: FloatArray) -> LocalAnswer:
         elevation, variance = _interpolate(prepared.mesh, np.column_stack([easting, northing]))
         is_inside = np.isfinite(elevation)
-        # the corners' mean noise over the answer's variance; infinitely many where noise is not measurable
-        n_effective = np.where(is_inside, prepared.noise_std**2 / np.maximum(variance, 1e-18), 0.0)
         return LocalAnswer(
             elevation=elevation,
             elevation_std=np.sqrt(variance),
             noise_std=np.full(elevation.shape, prepared.noise_std),
-            n_effective=np.where(is_inside, np.maximum(n_effective, 1.0), 0.0),
+            n_effective=np.where(is_inside, prepared.noise_std**2 / variance, 0.0),
         )
 
 

@@ -9,10 +9,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from changedetect.models.comparators.base import LocalAnswer, PointModel
-from changedetect.models.comparators.covariance import Covariance, Kernel, answer_from_moments
-from changedetect.models.comparators.observations import Observations
+from changedetect.models.comparators.covariance import Covariance, Kernel, answer_from_moments, parameter_ranges
+from changedetect.models.comparators.observations import Observations, nearest
 
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray
@@ -25,6 +26,7 @@ logger = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 class _Posterior:
     regressor: Any
+    tree: cKDTree
     covariance: Covariance
 
 
@@ -66,14 +68,10 @@ class ExactGPR(PointModel[_Posterior]):
         rng = np.random.default_rng(self.random_seed)
         n_subsample = min(self.n_subsample, len(observations))
         sample = np.sort(rng.choice(len(observations), n_subsample, replace=False))
-        relief = max(float(observations.elevation.var()), 1e-8)
-        extent = float(max(np.ptp(observations.easting), np.ptp(observations.northing)))
-        if extent == 0.0:
-            msg = "All points lie at one place; a covariance cannot be fitted."
-            raise ValueError(msg)
-        start = Covariance(self.kernel, relief, 0.2 * extent, 0.05 * relief)
-        bounds = ((1e-3 * relief, 1e3 * relief), (1e-4 * extent, 10.0 * extent), (1e-6 * relief, 10.0 * relief))
-        regressor = _regressor(start, observations.variance[sample], bounds)
+        ranges = parameter_ranges(observations)
+        relief, longest = 0.01 * ranges[0][1], ranges[1][1]
+        start = Covariance(self.kernel, relief, 0.1 * longest, 0.05 * relief)
+        regressor = _regressor(start, observations.variance[sample], ranges)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             regressor.fit(observations.positions[sample], observations.elevation[sample])
@@ -87,7 +85,7 @@ class ExactGPR(PointModel[_Posterior]):
         covariance = Covariance.from_parameters(self.kernel, parameters)
         regressor = _regressor(covariance, observations.variance, None)
         regressor.fit(observations.positions, observations.elevation)
-        return _Posterior(regressor, covariance)
+        return _Posterior(regressor, cKDTree(observations.positions), covariance)
 
     def _answer(self, prepared: _Posterior, easting: FloatArray, northing: FloatArray) -> LocalAnswer:
         places = np.column_stack([easting, northing])
@@ -96,13 +94,14 @@ class ExactGPR(PointModel[_Posterior]):
             warnings.filterwarnings("ignore", message="Predicted variances smaller than 0")
             elevation, std = prepared.regressor.predict(places, return_std=True)
         variance = std**2 - prepared.covariance.nugget
-        return answer_from_moments(prepared.covariance, elevation, variance)
+        distance, _ = nearest(prepared.tree, places, 1)
+        return answer_from_moments(prepared.covariance, elevation, variance, distance[:, 0])
 
 
-def _regressor(covariance: Covariance, variance: FloatArray, bounds: tuple[tuple[float, float], ...] | None) -> Any:
+def _regressor(covariance: Covariance, variance: FloatArray, bounds: list[tuple[float, float]] | None) -> Any:
     """Scikit-learn's regressor for a covariance; its hyper-parameters are fitted where `bounds` are given."""
     process, kernels = _scikit_learn("gaussian_process"), _scikit_learn("gaussian_process.kernels")
-    ranges = ("fixed", "fixed", "fixed") if bounds is None else bounds
+    ranges = ["fixed", "fixed", "fixed"] if bounds is None else bounds
     signal = kernels.ConstantKernel(covariance.signal_variance, ranges[0])
     if covariance.kernel == "rbf":
         shape = kernels.RBF(covariance.length_scale, ranges[1])

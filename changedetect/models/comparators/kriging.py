@@ -44,8 +44,7 @@ class NeighbourKriging(PointModel[_Neighbourhood]):
     -----
     With C the covariance of the neighbours including their noise, k that between the place and the neighbours and 1 a
     vector of ones, the unknown constant mean is mu = 1'C^-1 z / 1'C^-1 1, the surface mu + k'C^-1 (z - mu 1) and its
-    variance k0 - k'C^-1 k + (1 - 1'C^-1 k)^2 / (1'C^-1 1) [1]_. Far from all data the answer is that mean with more
-    than the prior variance, and counts as none.
+    variance k0 - k'C^-1 k + (1 - 1'C^-1 k)^2 / (1'C^-1 1) [1]_.
 
     References
     ----------
@@ -93,4 +92,4 @@ class NeighbourKriging(PointModel[_Neighbourhood]):
         elevation = mean + np.sum(weight * (observations.elevation[members] - mean[:, None]), axis=1)
         from_mean = (1.0 - weight.sum(axis=1)) ** 2 / precision
         variance = covariance.signal_variance - np.sum(weight * to_place, axis=1) + from_mean
-        return answer_from_moments(covariance, elevation, variance)
+        return answer_from_moments(covariance, elevation, variance, distance[:, 0], is_mean_known=False)

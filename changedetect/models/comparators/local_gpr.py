@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from changedetect.models.comparators.base import LocalAnswer, PointModel
 from changedetect.models.comparators.covariance import Covariance, Kernel, answer_from_moments, estimate_covariance
@@ -179,6 +180,8 @@ def _local_model(observations: Observations, members: IntArray, covariance: Cova
 
 
 def _local_answer(model: _LocalModel, places: FloatArray, covariance: Covariance) -> LocalAnswer:
-    cross = covariance.between(model.positions, places)
+    distance = cdist(model.positions, places)
+    cross = covariance.at_distance(distance)
     explained = np.sum(solve_triangular(model.factor, cross, lower=True) ** 2, axis=0)
-    return answer_from_moments(covariance, model.mean + model.weights @ cross, covariance.signal_variance - explained)
+    variance = covariance.signal_variance - explained
+    return answer_from_moments(covariance, model.mean + model.weights @ cross, variance, distance.min(axis=0))

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
+from scipy.spatial import cKDTree
 
 from changedetect.models.comparators.base import LocalAnswer, PointModel
 from changedetect.models.comparators.covariance import Covariance, Kernel, answer_from_moments, estimate_covariance
-from changedetect.models.comparators.observations import Observations
+from changedetect.models.comparators.observations import Observations, nearest
 
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray, IntArray
@@ -29,6 +30,7 @@ class _InducingPosterior:
     prior_factor: FloatArray
     posterior_factor: FloatArray
     weights: FloatArray
+    tree: cKDTree
     covariance: Covariance
 
 
@@ -102,15 +104,18 @@ class SparseGPR(PointModel[_InducingPosterior]):
             projected += basis @ (observations.elevation[block] / noise)
         posterior_factor = cholesky(precision, lower=True)
         weights = solve_triangular(posterior_factor, projected, lower=True)
-        return _InducingPosterior(inducing, prior_factor, posterior_factor, weights, covariance)
+        tree = cKDTree(observations.positions)
+        return _InducingPosterior(inducing, prior_factor, posterior_factor, weights, tree, covariance)
 
     def _answer(self, prepared: _InducingPosterior, easting: FloatArray, northing: FloatArray) -> LocalAnswer:
         covariance = prepared.covariance
-        cross = covariance.between(prepared.positions, np.column_stack([easting, northing]))
+        places = np.column_stack([easting, northing])
+        cross = covariance.between(prepared.positions, places)
         basis = solve_triangular(prepared.prior_factor, cross, lower=True)
         reduced = solve_triangular(prepared.posterior_factor, basis, lower=True)
         variance = covariance.signal_variance - np.sum(basis**2, axis=0) + np.sum(reduced**2, axis=0)
-        return answer_from_moments(covariance, prepared.weights @ reduced, variance)
+        distance, _ = nearest(prepared.tree, places, 1)
+        return answer_from_moments(covariance, prepared.weights @ reduced, variance, distance[:, 0])
 
 
 def inducing_points(positions: FloatArray, n_inducing: int) -> FloatArray:
