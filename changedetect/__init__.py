@@ -20,7 +20,7 @@ _PUBLIC = {
     "Programme": "changedetect.catalogue",
 }
 
-__all__ = ["Grid", "LWPRSurface", "PointCloud", "Prediction", "Programme", "SurfaceModel", "__version__"]  # noqa: F822
+__all__ = ["Grid", "LWPRSurface", "PointCloud", "Prediction", "Programme", "SurfaceModel", "__version__"]
 
 
 def __getattr__(name: str) -> Any:

@@ -111,7 +111,7 @@ def judge_change(
     nu = np.where(both, np.maximum(freedom, 1.0), np.nan)
     lod = stats.t.ppf(0.5 + 0.5 * settings.confidence, nu) * std
     threshold = settings.change_threshold_m
-    inside = stats.t.cdf((threshold - d) / std, nu) - stats.t.cdf((-threshold - d) / std, nu)
+    inside = np.asarray(stats.t.cdf((threshold - d) / std, nu) - stats.t.cdf((-threshold - d) / std, nu))
     classes = np.full(d.shape, OUTSIDE, np.uint8)
     classes[observed[0] | observed[1]] = NOT_OBSERVED
     classes[both] = BELOW_LEVEL_OF_DETECTION
@@ -121,7 +121,7 @@ def judge_change(
         dod=d,
         dod_std=std,
         level_of_detection=lod,
-        change_probability=1.0 - inside,
+        change_probability=np.subtract(1.0, inside),
         change_class=classes,
         z_score=d / std,
         degrees_of_freedom=nu,

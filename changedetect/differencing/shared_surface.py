@@ -67,7 +67,9 @@ def _joint_region(earlier: Cells, later: Cells) -> Region:
 
 
 def _surface(cells: Cells, region: Region, kernel: float) -> Level:
-    return build_level(CellPyramid(cells).for_kernel(kernel), Lattice.covering(region, kernel, _SPACING * kernel), 0.0, None)
+    return build_level(
+        CellPyramid(cells).for_kernel(kernel), Lattice.covering(region, kernel, _SPACING * kernel), 0.0, None
+    )
 
 
 def _without(cells: Cells, level: Level, sign: float = 1.0) -> Cells:

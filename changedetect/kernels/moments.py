@@ -23,9 +23,13 @@ variances of the observations, m2 (one over the weight until the noise has been 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
+
+if TYPE_CHECKING:
+    from changedetect.typing import FloatArray, IntArray
 
 __all__ = [
     "ELEVATION_UNIT",
@@ -57,7 +61,7 @@ _WEIGHT_MAX = 2**18
 
 
 @njit(cache=True, error_model="numpy")
-def integer_weights(sigma):
+def integer_weights(sigma: FloatArray) -> IntArray:
     """
     Integer weight of each observation from its standard deviation.
 
@@ -78,7 +82,7 @@ def integer_weights(sigma):
 
 
 @njit(cache=True, error_model="numpy")
-def cell_indices(easting, northing, cell_size):
+def cell_indices(easting: FloatArray, northing: FloatArray, cell_size: float) -> tuple[IntArray, IntArray]:
     """
     Row (northwards) and column (eastwards) of the cell holding each observation.
 
@@ -101,7 +105,7 @@ def cell_indices(easting, northing, cell_size):
 
 
 @njit(cache=True)
-def count_sort(key, n_keys):
+def count_sort(key: IntArray, n_keys: int) -> tuple[IntArray, IntArray]:
     """
     Stable counting sort of small non-negative integers.
 
@@ -131,7 +135,19 @@ def count_sort(key, n_keys):
 
 
 @njit(cache=True, error_model="numpy")
-def accumulate_tile(order, row, column, easting, northing, elevation, weight, cell_size, row0, column0, sums):
+def accumulate_tile(
+    order: IntArray,
+    row: IntArray,
+    column: IntArray,
+    easting: FloatArray,
+    northing: FloatArray,
+    elevation: FloatArray,
+    weight: IntArray,
+    cell_size: float,
+    row0: int,
+    column0: int,
+    sums: IntArray,
+) -> None:
     """
     Add observations to the dense integer sums of one tile.
 
@@ -172,7 +188,7 @@ def accumulate_tile(order, row, column, easting, northing, elevation, weight, ce
 
 
 @njit(cache=True)
-def collect_tile(sums):
+def collect_tile(sums: IntArray) -> tuple[IntArray, IntArray]:
     """
     Occupied cells of a dense tile.
 
@@ -204,7 +220,7 @@ def collect_tile(sums):
 
 
 @njit(cache=True, error_model="numpy")
-def moments_from_sums(sums, cell_size, weight_unit, time):
+def moments_from_sums(sums: IntArray, cell_size: float, weight_unit: float, time: float) -> FloatArray:
     """
     Floating-point moments from exact integer sums.
 
@@ -255,7 +271,9 @@ def moments_from_sums(sums, cell_size, weight_unit, time):
 
 
 @njit(cache=True, error_model="numpy")
-def shift_moments(moments, value, slope_east, slope_north):
+def shift_moments(
+    moments: FloatArray, value: FloatArray, slope_east: FloatArray, slope_north: FloatArray
+) -> FloatArray:
     """
     Moments of z - (value + slope . offset): a plane taken off every cell, exactly.
 
@@ -285,7 +303,7 @@ def shift_moments(moments, value, slope_east, slope_north):
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _add_recentred(m, u, v, o):
+def _add_recentred(m: FloatArray, u: float, v: float, o: FloatArray) -> None:
     """Add moments `m` to `o`, whose centre lies (-u, -v) away."""
     o[0] += m[0]
     o[1] += m[1]
@@ -303,7 +321,16 @@ def _add_recentred(m, u, v, o):
 
 
 @njit(cache=True, error_model="numpy")
-def deposit_moments(moments, row, column, source_size, cell_size, row0, column0, window):
+def deposit_moments(
+    moments: FloatArray,
+    row: IntArray,
+    column: IntArray,
+    source_size: float,
+    cell_size: float,
+    row0: int,
+    column0: int,
+    window: FloatArray,
+) -> None:
     """
     Add cells of one lattice to a dense window of another, each whole, re-centred on the cell it falls into.
 
@@ -337,7 +364,13 @@ def deposit_moments(moments, row, column, source_size, cell_size, row0, column0,
 
 
 @njit(cache=True, error_model="numpy")
-def gather_moments(moments, offset_east, offset_north, target, gathered):
+def gather_moments(
+    moments: FloatArray,
+    offset_east: FloatArray,
+    offset_north: FloatArray,
+    target: IntArray,
+    gathered: FloatArray,
+) -> None:
     """
     Add each cell, whole, to a target cell, re-centred.
 

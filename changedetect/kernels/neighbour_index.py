@@ -2,9 +2,9 @@
 Index of ellipses in the plane: which ones may reach a point, in a time that does not grow with their number.
 
 Every ellipse is entered in all cells of a square grid that it (or its bounding box) touches, so a point looks up the
-one cell it lies in. Grids with cells of 2^level serve ellipses of different sizes; a few ellipses of odd sizes, and all
-that are too large or too thin for any grid, go to a list that every point visits. Cells are found by hashing, so empty ground costs nothing and there are
-no borders. A cell is one cache line and overflows into a chain of further ones.
+one cell it lies in. Grids with cells of 2^level serve ellipses of different sizes; a few ellipses of odd sizes, and
+all that are too large or too thin for any grid, go to a list that every point visits. Cells are found by hashing, so
+empty ground costs nothing and there are no borders. A cell is one cache line and overflows into a chain of others.
 
 The index returns a superset of the ellipses that hold the point. Callers test each one themselves, hence it can never
 change a result, only the time taken: two cells that share a list (the packed key wraps around) do no harm.

@@ -15,15 +15,28 @@ References
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit, prange
 
-__all__ = ["N_FIT", "N_PLANE", "blend_planes", "fit_planes", "plane_information", "pool_noise", "shrink_planes", "survey_support"]
+if TYPE_CHECKING:
+    from changedetect.typing import FloatArray
+
+__all__ = [
+    "N_FIT",
+    "N_PLANE",
+    "blend_planes",
+    "fit_planes",
+    "plane_information",
+    "pool_noise",
+    "shrink_planes",
+    "survey_support",
+]
 
 #: Columns of `fit_planes`: 0 value, 1 slope east * h, 2 slope north * h, 3-8 covariance of these (00 01 02 11 12 22),
-#: 9 sum of weights, 10 effective number of observations, 11 weighted residual sum, 12 its expectation under the noise variances stated,
-#: 13 centroid offset / h, 14 mean time, 15 mean weight of an observation.
+#: 9 sum of weights, 10 effective number of observations, 11 weighted residual sum, 12 its expectation under the noise
+#: variances stated, 13 centroid offset / h, 14 mean time, 15 mean weight of an observation.
 N_FIT = 16
 #: Rows of a level's planes: 0 value, 1 slope east, 2 slope north, 3 variance of the surface, 4 blending weight,
 #: 5 noise variance of one observation, 6 support (1 or 0), 7 mean time, 8 shrinkage factor.
@@ -33,7 +46,17 @@ _RIDGE = 1e-3
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, first_column, fits):
+def fit_planes(
+    window: FloatArray,
+    cell_size: float,
+    row0: int,
+    column0: int,
+    kernel: float,
+    spacing: float,
+    first_row: int,
+    first_column: int,
+    fits: FloatArray,
+) -> None:
     """
     Weighted local plane of every receptive field of a lattice block.
 
@@ -65,7 +88,6 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
     per_h = 1.0 / kernel
     per_h2 = per_h * per_h
     for i in prange(fits.shape[0]):
-        a_matrix = np.zeros((3, 3))
         y0 = (first_row + i + 0.5) * spacing
         a_low = max(0, int(math.floor((y0 - radius) / cell_size)) - row0)
         a_high = min(window.shape[0] - 1, int(math.floor((y0 + radius) / cell_size)) - row0)
@@ -168,7 +190,7 @@ def fit_planes(window, cell_size, row0, column0, kernel, spacing, first_row, fir
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def plane_information(fits, n_minimum, limit, information):
+def plane_information(fits: FloatArray, n_minimum: float, limit: float, information: FloatArray) -> None:
     """
     How many noise standard deviations, squared, each plane is away from zero: beta' C^-1 beta.
 
@@ -205,7 +227,15 @@ def plane_information(fits, n_minimum, limit, information):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def shrink_planes(fits, base, information, detail, kernel, shrinkage, planes):
+def shrink_planes(
+    fits: FloatArray,
+    base: FloatArray,
+    information: FloatArray,
+    detail: FloatArray,
+    kernel: float,
+    shrinkage: float,
+    planes: FloatArray,
+) -> None:
     """
     Planes of one level: what the coarser levels left over, shrunk.
 
@@ -266,7 +296,16 @@ def shrink_planes(fits, base, information, detail, kernel, shrinkage, planes):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def blend_planes(easting, northing, planes, spacing, first_row, first_column, reach, blended):
+def blend_planes(
+    easting: FloatArray,
+    northing: FloatArray,
+    planes: FloatArray,
+    spacing: float,
+    first_row: int,
+    first_column: int,
+    reach: float,
+    blended: FloatArray,
+) -> None:
     """
     Surface, slope and variance at scattered places: eq. 1 of the paper with weights w_k / Gamma_k.
 
@@ -335,7 +374,7 @@ def blend_planes(easting, northing, planes, spacing, first_row, first_column, re
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def pool_noise(fits, reach, n_minimum, fallback, pooled):
+def pool_noise(fits: FloatArray, reach: int, n_minimum: float, fallback: float, pooled: FloatArray) -> None:
     """
     Variance factor of the observations around each receptive field, insensitive to what its plane cannot follow.
 
@@ -385,7 +424,17 @@ def pool_noise(fits, reach, n_minimum, fallback, pooled):
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def survey_support(window, cell_size, row0, column0, kernel, spacing, first_row, first_column, support):
+def survey_support(
+    window: FloatArray,
+    cell_size: float,
+    row0: int,
+    column0: int,
+    kernel: float,
+    spacing: float,
+    first_row: int,
+    first_column: int,
+    support: FloatArray,
+) -> None:
     """
     What observations surround each receptive field, every one counting the same.
 

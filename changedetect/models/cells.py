@@ -46,7 +46,9 @@ class Cells:
     @property
     def centres(self) -> Coordinates:
         """Easting and northing of the cell centres, m."""
-        return (self.column + 0.5) * self.cell_size, (self.row + 0.5) * self.cell_size
+        easting = np.asarray((self.column + 0.5) * self.cell_size, np.float64)
+        northing = np.asarray((self.row + 0.5) * self.cell_size, np.float64)
+        return easting, northing
 
     @property
     def region(self) -> Region:
@@ -63,7 +65,9 @@ class Cells:
     def places(self) -> Coordinates:
         """Easting and northing of the mean position of each cell's observations, m."""
         easting, northing = self.centres
-        return easting + self.moments[:, 2] / self.moments[:, 1], northing + self.moments[:, 3] / self.moments[:, 1]
+        mean_east: FloatArray = self.moments[:, 2] / self.moments[:, 1]
+        mean_north: FloatArray = self.moments[:, 3] / self.moments[:, 1]
+        return easting + mean_east, northing + mean_north
 
     def with_surface_removed(self, surface: FloatArray) -> Self:
         """

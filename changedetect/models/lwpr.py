@@ -151,6 +151,13 @@ class LWPRSurface:
     True
     """
 
+    evidence_: Evidence
+    memory_: Cells | None
+    survey_time_: float
+    own_kernel_: float
+    memory_kernel_: float
+    kernels_: tuple[float, ...]
+
     def __init__(
         self, settings: AdaptiveConfig | None = None, memory_days: float = 730.0, resolution: float | None = None
     ) -> None:
@@ -332,7 +339,7 @@ class LWPRSurface:
         """Take over the memory and the kernel bank of the epoch before."""
         self.__dict__.pop("_built", None)
         finest = self.own_kernel_ * _FINEST_LEVEL
-        self.memory_: Cells | None = None
+        self.memory_ = None
         self.memory_kernel_ = self.own_kernel_
         if parent is not None:
             self.memory_ = parent._faded_memory(self.survey_time_)
@@ -346,7 +353,7 @@ class LWPRSurface:
         if self.settings.kernel_min_m is not None:
             return self.settings.kernel_min_m
         wanted = max(_FINEST_KERNEL * spacing, self.resolution or 0.0)
-        return 2.0 ** (round(2.0 * math.log2(wanted)) / 2.0)
+        return float(2.0 ** (round(2.0 * math.log2(wanted)) / 2.0))
 
     def _cell_size(self, spacing: float) -> float:
         """
@@ -358,7 +365,7 @@ class LWPRSurface:
         kernel = self.own_kernel_
         is_dense = kernel >= 2.0 * _FINEST_KERNEL * spacing
         wanted = self.settings.cell_size_m or (kernel if is_dense else 0.5 * kernel)
-        return 2.0 ** math.floor(math.log2(wanted) + 1e-9)
+        return float(2.0 ** math.floor(math.log2(wanted) + 1e-9))
 
     def _refine(self, cells: Cells) -> Level:
         return refine(cells, self.kernels_, self.settings.lattice_spacing, self.settings.shrinkage)

@@ -8,9 +8,10 @@ from these, bit for bit.
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -27,8 +28,12 @@ if TYPE_CHECKING:
     from changedetect.models.lwpr import LWPRSurface
     from changedetect.typing import IntArray
 
-__all__ = ["STATE_VERSION", "read_state", "write_state"]
+    Model = TypeVar("Model", bound=LWPRSurface)
 
+__all__ = ["ADAPTIVE_FILE", "STATE_VERSION", "read_state", "write_state"]
+
+#: The file that tells a folder holds an adaptive model.
+ADAPTIVE_FILE = "model.nc"
 #: Version of this layout; a reader refuses any other.
 STATE_VERSION = 1
 #: Cells along one edge of a storage tile.
@@ -60,7 +65,7 @@ def write_state(directory: Path, model: LWPRSurface) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     evidence, memory = _evidence_files(model.evidence_), _memory_files(model.memory_)
     for name, dataset in (evidence | memory).items():
-        encoding = {v: {"zlib": True, "complevel": 4, "shuffle": True} for v in dataset.data_vars}
+        encoding = {str(v): {"zlib": True, "complevel": 4, "shuffle": True} for v in dataset.data_vars}
         write_dataset(directory / name, dataset, encoding)
     head = xr.Dataset({"kernels": ("level", np.array(model.kernels_), {"units": "m", "long_name": "kernel sizes"})})
     head.attrs = {
@@ -76,10 +81,10 @@ def write_state(directory: Path, model: LWPRSurface) -> None:
         "is_weighted": int(model.evidence_.is_weighted),
         "files": json.dumps(sorted(evidence | memory)),
     }
-    write_dataset(directory / "model.nc", head)
+    write_dataset(directory / ADAPTIVE_FILE, head)
 
 
-def read_state(directory: Path, kind: type[LWPRSurface]) -> Any:
+def read_state(directory: Path, kind: type[Model]) -> Model:
     """
     Read a model's state; see `LWPRSurface.load`.
 
@@ -88,7 +93,7 @@ def read_state(directory: Path, kind: type[LWPRSurface]) -> Any:
     ModelStateError
         A file is missing, damaged, or of another format version.
     """
-    head = read_dataset(directory / "model.nc")
+    head = read_dataset(directory / ADAPTIVE_FILE)
     version = head.attrs.get("state_version")
     if version != STATE_VERSION:
         msg = (
@@ -141,9 +146,7 @@ def _evidence_files(evidence: Evidence) -> dict[str, xr.Dataset]:
         s[:, 8] -= mean * s[:, 2]
         s[:, 9] -= mean * s[:, 3]
         lanes = {
-            name: ("cell", _narrow(s[:, k]))
-            for k, name in enumerate(_LANES)
-            if name != "w" or evidence.is_weighted
+            name: ("cell", _narrow(s[:, k])) for k, name in enumerate(_LANES) if name != "w" or evidence.is_weighted
         }
         lanes["row"] = ("cell", _narrow(row[members] - r * _STORAGE_CELLS))
         lanes["column"] = ("cell", _narrow(column[members] - c * _STORAGE_CELLS))
@@ -177,7 +180,7 @@ def _load_evidence(evidence: Evidence, dataset: xr.Dataset) -> None:
     tile = (row // TILE_CELLS) * (1 << 31) + column // TILE_CELLS
     order = np.lexsort((column, row, tile))
     starts = np.flatnonzero(np.r_[True, np.diff(tile[order]) != 0, True])
-    for a, b in zip(starts[:-1], starts[1:], strict=True):
+    for a, b in itertools.pairwise(starts):
         members = order[a:b]
         r, c = row[members], column[members]
         key = (r % TILE_CELLS) * TILE_CELLS + c % TILE_CELLS

@@ -147,7 +147,9 @@ def scale_bank(finest: float, coarsest: float, ratio: float) -> list[float]:
     return [finest * ratio**k for k in range(n, -1, -1)]
 
 
-def _walk_blocks(kernel_function: Callable[..., None], cells: Cells, lattice: Lattice, results: FloatArray) -> FloatArray:
+def _walk_blocks(
+    kernel_function: Callable[..., None], cells: Cells, lattice: Lattice, results: FloatArray
+) -> FloatArray:
     """Run a kernel over all fields of a lattice, block by block; blocks bound the memory and change no result."""
     c = cells.cell_size
     radius = 2.0 * lattice.kernel

@@ -13,11 +13,12 @@ from pydantic.dataclasses import dataclass
 
 from changedetect.config import LWPRConfig
 from changedetect.kernels.lwpr import learn
-from changedetect.kernels.lwpr_predict import NoisePrior, SurfacePrediction, mean_residuals, predict_surface
+from changedetect.kernels.lwpr_predict import SurfacePrediction, predict_surface
 from changedetect.kernels.lwpr_search import LWPRState
-from changedetect.kernels.lwpr_state import BISQUARE, GAUSSIAN, TRUST_COUNT, Parameters
+from changedetect.kernels.lwpr_state import BISQUARE, GAUSSIAN, Parameters
 from changedetect.models.base import Prediction
 from changedetect.models.lwpr import check_observations, point_density
+from changedetect.models.reference_epochs import OBSERVED_MASS, inherit, move_to, noise_prior
 from changedetect.models.reference_state import read_state, write_state
 
 if TYPE_CHECKING:
@@ -29,18 +30,8 @@ __all__ = ["ReferenceLWPR", "ReferenceSettings"]
 
 logger = logging.getLogger(__name__)
 
-#: Mass of activations that makes a receptive field observed in an epoch: one sample at its centre.
-_OBSERVED_MASS = 1.0
-#: Forgetting never leaves less than this, so that sums stay far from underflow.
-_LEAST_OBSERVATIONS = 1e-3
 #: Positions that agree to this are the same place to the pseudo-random order of samples, m.
 _ORDER_QUANTUM_M = 1e-3
-#: Sums over samples: what forgetting scales. Means, axes, slopes and counts that open gates stay.
-_SUMS = (
-    *("SXY1_x", "SXY1_y", "SXY2_x", "SXY2_y", "SSX1_x", "SSX1_y", "SSX2_x", "SSX2_y", "SSs2_1", "SSs2_2"),
-    *("W", "W2", "Wcv", "E2", "Ecv_1", "Ecv_2", "p"),
-)
-_METRIC_SUMS = ("H_1", "H_2", "r_1", "r_2")
 
 
 @dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
@@ -267,7 +258,7 @@ class ReferenceLWPR:
         x, y = self._normalised(easting, northing)
         z = z / self.settings.output_scale
         self.elevations_ = _merged_moments(self.elevations_, z)
-        _move_to(self.state_, x, y, z, self.parameters_.kernel)
+        move_to(self.state_, x, y, z, self.parameters_.kernel)
         learn(self.state_, x, y, z, self.parameters_)
         west, east, south, north = self.region_
         self.region_ = (
@@ -377,7 +368,7 @@ class ReferenceLWPR:
             raise ValueError(msg)
         elif time > present:
             decay = math.exp(-(time - present) / self.memory_days)
-            _inherit(self.state_, decay, self.prior_observations, present, self.settings.initial_forgetting_factor)
+            inherit(self.state_, decay, self.prior_observations, present, self.settings.initial_forgetting_factor)
         self.survey_time_ = time
         self.parameters_ = self.parameters_._replace(survey_time=time)
 
@@ -391,10 +382,10 @@ class ReferenceLWPR:
             nothing, none = np.full(easting.shape, np.nan), np.zeros(easting.shape)
             return SurfacePrediction(nothing, nothing, nothing, none, none, nothing, none)
         x, y = self._normalised(easting, northing)
-        prior = _noise_prior(self.state_, self.elevations_, self.settings.noise_prior_observations)
+        prior = noise_prior(self.state_, self.elevations_, self.settings.noise_prior_observations)
         answer = predict_surface(self.state_, x, y, self.parameters_.kernel, prior, cutoff=self.settings.cutoff)
         # what this epoch observed is entered in the fields only when it ends
-        answer.observed_time[answer.field_epoch_mass >= _OBSERVED_MASS] = self.survey_time_
+        answer.observed_time[answer.field_epoch_mass >= OBSERVED_MASS] = self.survey_time_
         return answer
 
 
@@ -441,7 +432,7 @@ def _hashed_order(easting: FloatArray, northing: FloatArray, elevation: FloatArr
     """
     mixed = np.zeros(easting.shape, dtype=np.uint64)
     for axis in (easting, northing):
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             mixed ^= np.rint(axis / _ORDER_QUANTUM_M).astype(np.int64).view(np.uint64)
             mixed += np.uint64(0x9E3779B97F4A7C15)
             mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -464,70 +455,3 @@ def _merged_moments(moments: tuple[float, float, float], values: FloatArray) -> 
     total, step = count + n, new_mean - mean
     new_squares = float(np.square(values - new_mean).sum())
     return total, mean + step * n / total, squares + new_squares + step * step * count * n / total
-
-
-def _inherit(state: LWPRState, decay: float, prior_observations: float, ended: float, forgetting: float) -> None:
-    """
-    Let an epoch's statistics fade into the prior of the next.
-
-    Parameters
-    ----------
-    state : LWPRState
-        Changed in place.
-    decay : float
-        Factor of all sums for the time that passes.
-    prior_observations : float
-        Most observations that a field's sums count for then.
-    ended : float, days
-        Time of the epoch that ends.
-    forgetting : float
-        Forgetting factor to start again with.
-    """
-    fields, metrics = state.fields[: state.n_fields], state.metrics[: state.n_fields]
-    is_seen = fields["epoch_mass"] >= _OBSERVED_MASS
-    fields["observed_time"][is_seen] = ended
-    fields["epoch_mass"] = 0.0
-    fields["lam"] = forgetting
-    with np.errstate(divide="ignore", invalid="ignore"):
-        n_effective = np.where(fields["W2"] > 0.0, fields["W"] ** 2 / fields["W2"], 0.0)
-        kept = np.clip(decay * n_effective, min(_LEAST_OBSERVATIONS, prior_observations), prior_observations)
-        factor = np.where(n_effective > 0.0, np.minimum(kept / n_effective, 1.0), 1.0)
-    for name in _SUMS:
-        fields[name] *= factor
-    for name in _METRIC_SUMS:
-        metrics[name] *= factor
-
-
-def _move_to(state: LWPRState, x: FloatArray, y: FloatArray, target: FloatArray, kernel: int) -> None:
-    """
-    Raise or lower inherited planes to the level of a new epoch's samples, before these are learned.
-
-    What is inherited is a prior for the shape of the ground, not for its height: it would attenuate a change by the
-    share that it still has after the last sample, and the way from the old height to the new one would pass for noise.
-    Only fields the epoch has not reached yet are moved: all the way if these samples make them observed, less where
-    they are met by less.
-    """
-    fields = state.fields[: state.n_fields]
-    is_inherited = fields["epoch_mass"] == 0.0
-    if is_inherited.any():
-        mean, mass = mean_residuals(state, x, y, target, kernel)
-        fields["beta0"] += np.where(is_inherited, mean * np.minimum(mass / _OBSERVED_MASS, 1.0), 0.0)
-
-
-def _noise_prior(state: LWPRState, elevations: tuple[float, float, float], weight: float) -> NoisePrior:
-    """
-    Pooled noise variance of all trusted fields.
-
-    It is their geometric mean, each weighted by what it knows: noise differs between places by factors, and a quiet
-    field must not take over the variance of noisy ones. Where no field holds residuals yet, the variance of the
-    elevations themselves is all that bounds it.
-    """
-    fields = state.fields[: state.n_fields]
-    mass = fields["Wcv"] * (1.0 - fields["p"] / fields["W"])
-    energy = np.where(fields["N"] > TRUST_COUNT, fields["Ecv_2"], fields["Ecv_1"])
-    is_known = (fields["trusted"] > 0.0) & (mass > 0.0) & (energy > 0.0)
-    if is_known.any():
-        mass, energy = mass[is_known], energy[is_known]
-        return NoisePrior(float(np.exp(np.average(np.log(energy / mass), weights=mass))), weight)
-    count, _, squares = elevations
-    return NoisePrior(squares / count if count else math.nan, weight)

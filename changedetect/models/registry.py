@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from changedetect.errors import ModelStateError
 from changedetect.models.lwpr import LWPRSurface
+from changedetect.models.lwpr_state import ADAPTIVE_FILE
 from changedetect.models.reference import ReferenceLWPR
-from changedetect.storage import read_json, write_json
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from changedetect.config import ProgrammeConfig
-    from changedetect.models.base import SurfaceModel
 
-__all__ = ["create_model", "load_model", "save_model"]
-
-_MODE_FILE = "mode.json"
-_KINDS = {"adaptive": LWPRSurface, "reference": ReferenceLWPR}
+__all__ = ["create_model", "load_model"]
 
 
 def create_model(config: ProgrammeConfig) -> LWPRSurface | ReferenceLWPR:
@@ -28,16 +23,6 @@ def create_model(config: ProgrammeConfig) -> LWPRSurface | ReferenceLWPR:
     return LWPRSurface(config.adaptive, config.memory_days, config.resolution)
 
 
-def save_model(model: SurfaceModel, directory: Path) -> None:
-    """Persist a model into a folder, with a note of its kind."""
-    mode = next((name for name, kind in _KINDS.items() if isinstance(model, kind)), None)
-    if mode is None:
-        msg = f"a {type(model).__name__} cannot be persisted in a programme; use one of {sorted(_KINDS)}"
-        raise ModelStateError(msg)
-    model.save(directory)
-    write_json(directory / _MODE_FILE, {"mode": mode})
-
-
 def load_model(directory: Path) -> LWPRSurface | ReferenceLWPR:
     """
     Read the model a folder holds.
@@ -45,12 +30,10 @@ def load_model(directory: Path) -> LWPRSurface | ReferenceLWPR:
     Raises
     ------
     ModelStateError
-        The state is damaged or of an unknown kind.
+        The state is damaged.
     MissingInputError
         There is no state.
     """
-    mode = read_json(directory / _MODE_FILE).get("mode")
-    if mode not in _KINDS:
-        msg = f"{directory / _MODE_FILE} names the model {mode!r}; this software knows {sorted(_KINDS)}"
-        raise ModelStateError(msg)
-    return _KINDS[mode].load(directory)
+    if (directory / ADAPTIVE_FILE).exists():
+        return LWPRSurface.load(directory)
+    return ReferenceLWPR.load(directory)

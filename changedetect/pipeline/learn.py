@@ -12,7 +12,7 @@ from changedetect.catalogue import Epoch, Programme, SourceRecord, StateRecord, 
 from changedetect.errors import ModelStateError
 from changedetect.models.lwpr import LWPRSurface
 from changedetect.models.reference import ReferenceLWPR
-from changedetect.models.registry import create_model, load_model, save_model
+from changedetect.models.registry import create_model, load_model
 from changedetect.pipeline.manifest import utc_now
 from changedetect.pipeline.reading import read_epoch_points
 from changedetect.storage import atomic_directory
@@ -139,7 +139,7 @@ def _write_state(programme: Programme, epoch: Epoch, parent: Epoch | None, learn
     parent_record = programme.state_record(parent.epoch_id) if parent else None
     config = programme.config
     with atomic_directory(programme.state_directory(epoch.epoch_id)) as temporary:
-        save_model(learned.model, temporary)
+        learned.model.save(temporary)
         StateRecord(
             epoch_id=epoch.epoch_id,
             mode=config.model,

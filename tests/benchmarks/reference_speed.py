@@ -5,8 +5,9 @@ Speed of reference mode, one core: learning and prediction per sample, with few 
 
 Learning, fixed metric, w_gen 0.1: samples in random order over ground of constant density, so that a sample activates
 as many receptive fields of a hundred as of ten thousand. The two learners take turns, batch by batch, and the fastest
-and the median batch of each are given: on a shared machine the fastest says what the code costs, the median what the
-neighbours leave of it. Bars: 1.5 us per point, and 1.3 for the ratio of many to few; prediction 0.5 us per cell.
+and the median batch of each are given, in processor time of the one thread that works: on a shared machine the fastest
+says what the code costs, the median what the neighbours leave of the caches. Bars: 1.5 us per point, and 1.3 for the
+ratio of many to few; prediction 0.5 us per cell.
 """
 
 from __future__ import annotations

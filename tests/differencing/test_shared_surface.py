@@ -1,4 +1,4 @@
-"""The difference estimator: calibrated on unchanged ground, unbiased on changed ground, honest where nothing was seen."""
+"""The difference estimator: calibrated on unchanged ground, unbiased on change, silent where nothing was seen."""
 
 import numpy as np
 import pytest

@@ -28,8 +28,11 @@ from changedetect.synthetic import SurveyDesign, survey_points, trees_scene
 
 #: Small subsamples for the covariance, for tests of anything but its accuracy.
 QUICK = {
-    **dict.fromkeys(("gpr_rbf", "gpr_matern32"), {"n_subsample": 150}),
-    **dict.fromkeys(("kriging", "local_gpr", "sparse_gpr"), {"n_blocks": 6, "block_size": 40}),
+    "gpr_rbf": {"n_subsample": 150},
+    "gpr_matern32": {"n_subsample": 150},
+    "kriging": {"n_blocks": 6, "block_size": 40},
+    "local_gpr": {"n_blocks": 6, "block_size": 40},
+    "sparse_gpr": {"n_blocks": 6, "block_size": 40},
 }
 
 CORNER = np.array([500_000.0, 5_300_000.0])

@@ -216,6 +216,18 @@ def test_a_reloaded_model_answers_and_learns_bit_for_bit_alike(model, tmp_path):
     )
 
 
+def test_all_settings_survive_storage(tmp_path):
+    settings = ReferenceSettings(
+        kernel="bisquare", initial_distance_metric=((4.0, 1.0), (1.0, 2.0)), learn_metric=True, penalty=1e-7, cutoff=0.0
+    )
+    fitted = ReferenceLWPR(settings, memory_days=100.0, prior_observations=2.0).fit(*survey(n=400))
+    fitted.save(tmp_path)
+    loaded = ReferenceLWPR.load(tmp_path)
+    assert (loaded.settings, loaded.memory_days, loaded.prior_observations) == (settings, 100.0, 2.0)
+    assert loaded.parameters_ == fitted.parameters_
+    assert_same_answers(fitted, loaded)
+
+
 def test_state_is_readable_without_this_software(model, tmp_path):
     model.save(tmp_path)
     with xr.open_dataset(tmp_path / "reference_lwpr.nc") as dataset:

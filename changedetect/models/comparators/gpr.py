@@ -43,7 +43,7 @@ class ExactGPR(PointModel[_Posterior]):
     random_seed : int
         Of the subsample.
     max_points : int or None
-        5000 points take about 0.6 GB and a minute on two cores.
+        5000 points take 0.9 GB and, on one core, 7 s to learn and 0.8 s for 1000 places.
 
     Notes
     -----
