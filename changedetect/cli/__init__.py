@@ -17,14 +17,10 @@ import typer
 
 from changedetect.cli.app import app
 from changedetect.cli.session import print_error, wants_json
-from changedetect.errors import ChangeDetectError
 
 __all__ = ["main"]
 
 logger = logging.getLogger(__name__)
-
-INTERRUPTED = 130
-INPUT_OUTPUT = 74
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -44,18 +40,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     is_json = wants_json(arguments)
     try:
         result: Any = app(args=list(arguments), prog_name="changedetect", standalone_mode=False)
-    except ChangeDetectError as error:
-        return print_error(error, error.exit_code, is_json=is_json)
     except typer.TyperException as error:
         if is_json or not hasattr(error, "show"):
             return print_error(error, error.exit_code, is_json=is_json)
         error.show()
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
-        return print_error(KeyboardInterrupt("Interrupted."), INTERRUPTED, is_json=is_json)
-    except OSError as error:
-        return print_error(error, INPUT_OUTPUT, is_json=is_json)
+        return _report(KeyboardInterrupt("Interrupted."), is_json=is_json)
     except Exception as error:
-        logger.critical("Unexpected failure, a bug in changedetect:", exc_info=True)
-        return print_error(error, 1, is_json=is_json)
+        return _report(error, is_json=is_json)
     return result if isinstance(result, int) else 0
+
+
+def _report(error: BaseException, *, is_json: bool) -> int:
+    from changedetect.pipeline.manifest import exit_code_of
+
+    exit_code = exit_code_of(error)
+    if exit_code == 1:
+        logger.critical("Unexpected failure, a bug in changedetect:", exc_info=error)
+    return print_error(error, exit_code, is_json=is_json)

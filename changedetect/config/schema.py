@@ -109,7 +109,7 @@ class LWPRConfig:
     activation_threshold: Annotated[float, Field(gt=0, lt=1)] = 0.1
     prune_threshold: Annotated[float, Field(gt=0, le=1)] = 1.0
     initial_kernel_m: Annotated[float, Field(gt=0)] | None = None
-    observations_per_field: Annotated[float, Field(gt=0)] = 16.0
+    observations_per_field: Annotated[float, Field(gt=0)] = 20.0
     initial_forgetting_factor: Annotated[float, Field(gt=0, le=1)] = 0.99
     final_forgetting_factor: Annotated[float, Field(gt=0, le=1)] = 0.999
     forgetting_annealing: Annotated[float, Field(ge=0, le=1)] = 0.9995

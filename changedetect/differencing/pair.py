@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["difference_models"]
 
-#: A cell counts as observed by a reference-mode epoch with at least this activation mass of its observations.
-_REFERENCE_MINIMUM = 1.0
+#: A cell counts as observed by a reference-mode epoch with at least this effective number of observations.
+_REFERENCE_MINIMUM = 2.0
 
 
 def difference_models(

@@ -120,6 +120,8 @@ def estimate_difference(
     freedom, both summed over a window of two kernels either side; observations are taken as independent.
     """
     region = _joint_region(earlier, later)
+    earlier, height = earlier.centred()
+    later = later.with_surface_removed(np.tile([height, 0.0, 0.0], (len(later), 1)))
     fine = _SHARED_KERNEL * min(kernels)
     wide = _CHANGE_KERNEL * max(kernels)
     change: Level | None = None

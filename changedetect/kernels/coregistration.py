@@ -1,9 +1,12 @@
 """
-Kernels of co-registration: bicubic elevation and slope of a raster, and a spatially stratified choice of points.
+Kernels of co-registration: bicubic elevation and slope of a raster, a spatially stratified choice of points, and the
+likelihood of correlated errors.
 
 References
 ----------
 .. [1] R. Keys (1981), Cubic convolution interpolation for digital image processing, IEEE Trans. ASSP 29, 1153-1160.
+.. [2] H. D. Patterson, R. Thompson (1971), Recovery of inter-block information when block sizes are unequal,
+   Biometrika 58, 545-554.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
-__all__ = ["interpolate_raster", "keep_smallest"]
+__all__ = ["interpolate_raster", "keep_smallest", "restricted_likelihood"]
 
 
 @njit(cache=True, error_model="numpy")
@@ -114,3 +117,84 @@ def keep_smallest(cell, key, easting, northing, elevation, sigma, best_key, best
                     continue
         best_key[c] = key[p]
         o[0], o[1], o[2], o[3] = easting[p], northing[p], elevation[p], sigma[p]
+
+
+@njit(cache=True, error_model="numpy")
+def restricted_likelihood(columns, distance, dilution, share, length, exponent):
+    """
+    Restricted likelihood of correlated means, their variance profiled out.
+
+    Parameters
+    ----------
+    columns : array, shape (m, k + 1)
+        Design of the fitted parameters, then the means.
+    distance : array, shape (m, m), m
+    dilution : array, shape (m,)
+        Variance of the independent part of each mean, relative to the typical one.
+    share : float, 0 to 1
+        Correlated part of the variance.
+    length : float, m
+    exponent : {1, 2}
+        Correlation exp(-d / length) or exp(-d2 / (2 length2)).
+
+    Returns
+    -------
+    log_likelihood, variance : float
+        Less a constant; -inf and 0 where the covariance matrix is not positive definite.
+
+    Notes
+    -----
+    With C = U'U the covariance for a variance of one, X the design and y the means, both multiplied by U'^-1 [2]_:
+    -1/2 ((m - k) log s2 + log det C + log det X'X), s2 the mean square of what X leaves of y. Written out instead of
+    calling LAPACK, whose threads cost more than they save on matrices of this size.
+    """
+    m, k = columns.shape[0], columns.shape[1] - 1
+    u = np.empty((m, m))
+    for i in range(m):
+        for j in range(i, m):
+            d = distance[i, j] / length
+            u[i, j] = share * (math.exp(-d) if exponent == 1 else math.exp(-0.5 * d * d))
+        # a trace of white noise keeps a smooth correlation positive definite
+        u[i, i] = share + (1.0 - share) * dilution[i] + 1e-6
+    w = columns.copy()
+    log_det = 0.0
+    for j in range(m):
+        if not u[j, j] > 0.0:
+            return -math.inf, 0.0
+        pivot = math.sqrt(u[j, j])
+        log_det += 2.0 * math.log(pivot)
+        for c in range(j, m):
+            u[j, c] /= pivot
+        for c in range(k + 1):
+            w[j, c] /= pivot
+        for i in range(j + 1, m):
+            f = u[j, i]
+            for c in range(i, m):
+                u[i, c] -= f * u[j, c]
+            for c in range(k + 1):
+                w[i, c] -= f * w[j, c]
+    freedom = m
+    for a in range(k + 1):
+        before = after = 0.0
+        for i in range(m):
+            before += w[i, a] * w[i, a]
+        for b in range(a):
+            dot = 0.0
+            for i in range(m):
+                dot += w[i, a] * w[i, b]
+            for i in range(m):
+                w[i, a] -= dot * w[i, b]
+        for i in range(m):
+            after += w[i, a] * w[i, a]
+        if a == k:
+            variance = max(after / max(freedom, 1), 1e-300)
+            return -0.5 * (freedom * math.log(variance) + log_det), variance
+        # a column that the others hold already takes away no degree of freedom
+        is_new = after > 1e-12 * before
+        if is_new:
+            log_det += math.log(after)
+            freedom -= 1
+        norm = math.sqrt(after) if is_new else math.inf
+        for i in range(m):
+            w[i, a] /= norm
+    return -math.inf, 0.0

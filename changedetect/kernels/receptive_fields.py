@@ -42,7 +42,7 @@ N_FIT = 16
 #: 5 noise variance of one observation, 6 support (1 or 0), 7 mean time, 8 shrinkage factor.
 N_PLANE = 9
 #: Ridge on slopes, in observations: keeps the plane of collinear cells defined.
-_RIDGE = 1e-3
+_RIDGE = 1e-2
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -189,51 +189,36 @@ def fit_planes(
             o[15] = s0 / count
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def plane_information(fits: FloatArray, n_minimum: float, limit: float, information: FloatArray) -> None:
-    """
-    How many noise standard deviations, squared, each plane is away from zero: beta' C^-1 beta.
-
-    Parameters
-    ----------
-    fits : array, shape (n_i, n_j, N_FIT)
-    n_minimum : float
-        Effective number of observations a field needs.
-    limit : float
-        Larger values are cut off: beyond it a plane is kept whole in any case, and must not sway its neighbours.
-    information : array, shape (n_i, n_j)
-        Filled in place; -1 where a field has too few observations.
-    """
-    for i in prange(fits.shape[0]):
-        for j in range(fits.shape[1]):
-            o = fits[i, j]
-            information[i, j] = -1.0
-            if not (o[9] > 0.0 and o[10] >= n_minimum):
-                continue
-            a, b, c, d, e, f = o[3], o[4], o[5], o[6], o[7], o[8]
-            c00 = d * f - e * e
-            c01 = c * e - b * f
-            c02 = b * e - c * d
-            det = a * c00 + b * c01 + c * c02
-            if not det > 0.0:
-                information[i, j] = 0.0
-                continue
-            c11 = a * f - c * c
-            c12 = b * c - a * e
-            c22 = a * d - b * b
-            x, y, z = o[0], o[1], o[2]
-            q = x * x * c00 + y * y * c11 + z * z * c22 + 2.0 * (x * y * c01 + x * z * c02 + y * z * c12)
-            information[i, j] = min(max(q / det, 0.0), limit)
+@njit(cache=True, error_model="numpy")
+def _posterior_plane(o: FloatArray, t0: float, t1: float) -> tuple[float, float, float, float]:
+    """Weight of the value and posterior mean of the plane under a prior of variances t0 (value) and t1 (slopes)."""
+    if t0 <= 0.0 and t1 <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    a, b, c, d, e, f = o[3] + t0, o[4], o[5], o[6] + t1, o[7], o[8] + t1
+    c00 = d * f - e * e
+    c01 = c * e - b * f
+    c02 = b * e - c * d
+    det = a * c00 + b * c01 + c * c02
+    if not det > 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    c11 = a * f - c * c
+    c12 = b * c - a * e
+    c22 = a * d - b * b
+    x, y, z = o[0] / det, o[1] / det, o[2] / det
+    b0 = t0 * (c00 * x + c01 * y + c02 * z)
+    b1 = t1 * (c01 * x + c11 * y + c12 * z)
+    b2 = t1 * (c02 * x + c12 * y + c22 * z)
+    return t0 * c00 / det, b0, b1, b2
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def shrink_planes(
     fits: FloatArray,
     base: FloatArray,
-    information: FloatArray,
+    prior: FloatArray,
     detail: FloatArray,
     kernel: float,
-    shrinkage: float,
+    n_minimum: float,
     planes: FloatArray,
 ) -> None:
     """
@@ -245,36 +230,40 @@ def shrink_planes(
         Local planes of the residuals.
     base : array, shape (2, n_i, n_j)
         Variance of the coarser levels' sum at the centres, and whether it is defined (1 or 0).
-    information : array, shape (n_i, n_j)
-        `plane_information`, averaged over the neighbourhood; negative where a field has too few observations.
+    prior : array, shape (2, n_i, n_j), m2
+        Variance, over the neighbourhood, of the true values and of the true slopes times kernel of this level's
+        planes. Infinite takes a plane as fitted.
     detail : array, shape (n_i, n_j), m2
         Typical variance of what this level adds around there; enters the variance where the data of a field cannot
         tell.
     kernel : float, m
-    shrinkage : float
-        Strength c of the shrinkage; 0 takes every plane as fitted.
+    n_minimum : float
+        Effective number of observations a field needs.
     planes : array, shape (N_PLANE, n_i, n_j)
         Filled in place.
 
     Notes
     -----
-    Empirical Bayes, James-Stein form: s = max(0, 1 - 3 c / q) with q the information. The coarse estimate and this
-    level's share their data, so with v the variance of the coarse surface and C that of the unshrunk fine one the
-    combination has variance (1 - s) v + s C; detail that the field cannot see, of prior variance t, adds
-    t A / (t + A) (1 - s) with A = C - v.
+    Empirical Bayes: with prior covariance T = diag(t0, t1, t1) and C the noise covariance of the fitted plane beta, the
+    posterior mean is T (T + C)^-1 beta: directions that the data determine badly are shrunk most. The coarse estimate
+    and this level's share their data, so with s = [T (T + C)^-1]_00, v the variance of the coarse surface and C_00 that
+    of the unshrunk fine one the combination has variance (1 - s) v + s C_00; detail that the field cannot see, of prior
+    variance t, adds t A / (t + A) (1 - s) with A = C_00 - v.
     """
     for i in prange(fits.shape[0]):
         for j in range(fits.shape[1]):
             o = fits[i, j]
             is_based = base[1, i, j] > 0.0
-            is_fitted = information[i, j] >= 0.0
+            is_fitted = o[9] > 0.0 and o[10] >= n_minimum
             v = base[0, i, j] if is_based else 0.0
             s = 0.0
+            b0 = b1 = b2 = 0.0
             added = detail[i, j]
             if is_fitted:
-                s = 1.0
-                if is_based and shrinkage > 0.0:
-                    s = max(0.0, 1.0 - 3.0 * shrinkage / max(information[i, j], 1e-12))
+                s, b0, b1, b2 = 1.0, o[0], o[1], o[2]
+                t0, t1 = prior[0, i, j], prior[1, i, j]
+                if is_based and t0 < math.inf:
+                    s, b0, b1, b2 = _posterior_plane(o, t0, t1)
                 unseen = max(o[3] - v, 0.0)
                 t = detail[i, j]
                 added = t * unseen / (t + unseen) * (1.0 - s) if t + unseen > 0.0 else 0.0
@@ -282,13 +271,14 @@ def shrink_planes(
             if not is_based and not is_fitted:
                 planes[4, i, j] = 0.0
                 continue
-            planes[0, i, j] = s * o[0]
-            planes[1, i, j] = s * o[1] / kernel
-            planes[2, i, j] = s * o[2] / kernel
+            planes[0, i, j] = b0
+            planes[1, i, j] = b1 / kernel
+            planes[2, i, j] = b2 / kernel
             planes[3, i, j] = (1.0 - s) * v + s * o[3] + added
             gamma = detail[i, j] + 1e-8
             if is_fitted:
-                left = (1.0 - s) * (1.0 - s) * (o[0] * o[0] + 0.25 * (o[1] * o[1] + o[2] * o[2]))
+                d0, d1, d2 = o[0] - b0, o[1] - b1, o[2] - b2
+                left = d0 * d0 + 0.25 * (d1 * d1 + d2 * d2)
                 gamma = o[11] / max(o[12] * o[15], 0.3 * o[9]) + left + 1e-8
             elif o[9] > 0.0:
                 gamma += 10.0 / o[15]
@@ -320,8 +310,9 @@ def blend_planes(
         Radius of the blending kernel, lattice spacings.
     blended : array, shape (n, 8)
         Filled in place: value, slope east, slope north, variance, noise variance, support (0 to 1), mean time,
-        defined (1 or 0). The slopes are the exact derivative of the blend. Standard deviations are averaged, that is
-        neighbouring fields count as fully correlated.
+        defined (1 or 0). Slopes are the blended slopes of the fields; the derivative of the blend itself also holds
+        that of the weights, which at the rim of the data is large and means nothing. Standard deviations are
+        averaged, that is neighbouring fields count as fully correlated.
     """
     k = int(math.ceil(reach))
     radius = reach * spacing
@@ -331,7 +322,7 @@ def blend_planes(
         x, y = easting[p], northing[p]
         i0 = int(math.floor(y / spacing)) - first_row
         j0 = int(math.floor(x / spacing)) - first_column
-        w_sum = f_sum = wx = wy = fx = fy = sd = noise = support = time = flat = 0.0
+        w_sum = f_sum = fx = fy = sd = noise = support = time = flat = 0.0
         for i in range(max(0, i0 - k), min(n_i, i0 + k + 1)):
             dy = y - (first_row + i + 0.5) * spacing
             for j in range(max(0, j0 - k), min(n_j, j0 + k + 1)):
@@ -343,14 +334,11 @@ def blend_planes(
                 if q >= 1.0:
                     continue
                 w = (1.0 - q) * (1.0 - q) * g
-                slope = -4.0 * (1.0 - q) * g * per_r2
                 f = planes[0, i, j] + planes[1, i, j] * dx + planes[2, i, j] * dy
                 w_sum += w
                 f_sum += w * f
-                wx += slope * dx
-                wy += slope * dy
-                fx += w * planes[1, i, j] + slope * dx * f
-                fy += w * planes[2, i, j] + slope * dy * f
+                fx += w * planes[1, i, j]
+                fy += w * planes[2, i, j]
                 sd += w * math.sqrt(planes[3, i, j])
                 noise += w * planes[5, i, j]
                 # support and time belong to the place, not to the better fit: no Gamma here
@@ -364,8 +352,8 @@ def blend_planes(
             continue
         f = f_sum / w_sum
         o[0] = f
-        o[1] = (fx - f * wx) / w_sum
-        o[2] = (fy - f * wy) / w_sum
+        o[1] = fx / w_sum
+        o[2] = fy / w_sum
         o[3] = (sd / w_sum) ** 2
         o[4] = noise / w_sum
         o[5] = support / flat

@@ -88,6 +88,17 @@ class Cells:
         at_centre = surface[:, 0] - east * mean[:, 0] - north * mean[:, 1]
         return replace(self, moments=kernel.shift_moments(self.moments, at_centre, east, north))
 
+    def centred(self) -> tuple[Self, float]:
+        """
+        Moments about a mean elevation, and that elevation.
+
+        Squares of elevations far above zero would cost the residuals their last digits.
+        """
+        height = float(np.round(np.median(self.moments[:, 7] / self.moments[:, 1])))
+        level = np.zeros((len(self), 3))
+        level[:, 0] = height
+        return self.with_surface_removed(level), height
+
     def with_weights_scaled(self, factor: FloatArray | float) -> Self:
         """Weights, and all they enter, times a factor per cell; counts and noise variances stay."""
         scaled = self.moments * np.reshape(factor, (-1, 1))

@@ -211,6 +211,9 @@ class LWPRSurface:
             raise ValueError(msg)
         present = self.__dict__.get("survey_time_")
         time = float(survey_time) if survey_time is not None else (present if present is not None else 0.0)
+        if not math.isfinite(time):
+            msg = f"survey_time {time} is not finite; it counts days since 1970-01-01"
+            raise ValueError(msg)
         if present is not None and time < present:
             msg = f"survey_time {time} lies before the present epoch, {present}; epochs are learned in order of time"
             raise ValueError(msg)
@@ -396,6 +399,9 @@ class LWPRSurface:
         return memory.with_surface_removed(-moved)
 
     def _receptive_fields(self) -> _Built:
+        if "evidence_" not in self.__dict__:
+            msg = "the model has learned nothing yet; call fit first"
+            raise ValueError(msg)
         built = self.__dict__.get("_built")
         if built is None:
             built = self._build()

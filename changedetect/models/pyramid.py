@@ -14,7 +14,6 @@ from changedetect.kernels.receptive_fields import (
     N_PLANE,
     blend_planes,
     fit_planes,
-    plane_information,
     pool_noise,
     shrink_planes,
     survey_support,
@@ -40,10 +39,11 @@ CENTROID_LIMIT = 0.75
 NOISE_REACH = 3
 #: Lattice steps over which the typical detail of a level is averaged.
 _DETAIL_REACH = 6.0
-#: Lattice steps over which the evidence for detail is pooled. Alone, one field in three keeps a fifth of pure noise;
-#: of 0.7, 1.2 and 2.0 the last had the least error on dense and on sparse data.
-_INFORMATION_REACH = 2.0
-_INFORMATION_LIMIT = 300.0
+#: Lattice steps over which the prior variance of detail is pooled: of 0.7, 1.2 and 2.0 the last had the least error on
+#: dense and on sparse data.
+_PRIOR_REACH = 2.0
+#: A squared coefficient counts at most this many noise variances, so that an edge does not sway the ground beside it.
+_RATIO_LIMIT = 100.0
 #: Receptive fields along one edge of a block of work; bounds memory and changes no result.
 _BLOCK_FIELDS = 512
 
@@ -203,6 +203,7 @@ def noise_variance(cells: Cells, kernel: float, spacing: float) -> Level:
     level : Level
         Its values are variances: m2 for weights of one, else the factor by which the stated variances are off.
     """
+    cells, _ = cells.centred()
     lattice = Lattice.covering(cells.region, kernel, spacing)
     fits = fit_lattice(cells, lattice)
     usable = (fits[..., 10] >= N_MINIMUM + 1.0) & (fits[..., 12] > 0.0)
@@ -235,14 +236,32 @@ def _detail_variance(fits: FloatArray, base: FloatArray) -> FloatArray:
     return local
 
 
-def _pooled_information(fits: FloatArray) -> FloatArray:
-    """Information of each field's plane, averaged with its neighbours'; -1 where a field has too few observations."""
-    information = np.empty(fits.shape[:2])
-    plane_information(fits, N_MINIMUM, _INFORMATION_LIMIT, information)
-    fitted = information >= 0.0
-    mass = gaussian_filter(fitted.astype(np.float64), _INFORMATION_REACH, truncate=2.5, mode="constant")
-    total = gaussian_filter(np.where(fitted, information, 0.0), _INFORMATION_REACH, truncate=2.5, mode="constant")
-    return np.where(fitted, total / np.where(fitted, mass, 1.0), -1.0)
+def _prior_variance(fits: FloatArray, shrinkage: float) -> FloatArray:
+    """
+    Variance of the true values and slopes of a level's planes, pooled over the neighbourhood; m2.
+
+    The squares of fitted coefficients exceed their noise variance C by that variance. Pooled with weights 1 / C, so
+    that well-determined planes speak for the others, it is (mean(b^2 / C) - c) / mean(1 / C).
+    """
+    prior = np.full((2, *fits.shape[:2]), np.inf)
+    if shrinkage == 0.0:
+        return prior
+    fitted = (fits[..., 9] > 0.0) & (fits[..., 10] >= N_MINIMUM)
+
+    def smooth(values: FloatArray) -> FloatArray:
+        filled = np.where(fitted, values, 0.0)
+        smoothed: FloatArray = gaussian_filter(filled, _PRIOR_REACH, truncate=2.5, mode="constant")
+        return smoothed
+
+    mass = smooth(np.ones(fitted.shape))
+    squares = fits[..., :3] ** 2
+    noise = np.where(fitted[..., None], np.maximum(fits[..., (3, 6, 8)], 1e-14), 1.0)
+    ratio = np.minimum(squares / noise, _RATIO_LIMIT)
+    for k, part in enumerate((slice(0, 1), slice(1, 3))):
+        excess = smooth(ratio[..., part].mean(axis=-1)) - shrinkage * mass
+        precision = smooth((1.0 / noise[..., part]).mean(axis=-1))
+        prior[k] = np.where(fitted, np.maximum(excess, 0.0) / np.where(fitted, precision, 1.0), 0.0)
+    return prior
 
 
 def build_level(cells: Cells, lattice: Lattice, shrinkage: float, coarser: Level | None) -> Level:
@@ -271,8 +290,8 @@ def build_level(cells: Cells, lattice: Lattice, shrinkage: float, coarser: Level
         base[1] = at_centres[:, 7].reshape(lattice.shape)
     fits = fit_lattice(cells, lattice)
     planes = np.zeros((N_PLANE, *lattice.shape))
-    information = _pooled_information(fits)
-    shrink_planes(fits, base, information, _detail_variance(fits, base), lattice.kernel, shrinkage, planes)
+    prior = _prior_variance(fits, shrinkage)
+    shrink_planes(fits, base, prior, _detail_variance(fits, base), lattice.kernel, N_MINIMUM, planes)
     return Level(lattice, planes, _LEVEL_REACH)
 
 
@@ -300,6 +319,7 @@ def refine(cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shr
         msg = "a pyramid needs at least one occupied cell"
         raise ValueError(msg)
     region = cells.region
+    cells, height = cells.centred()
     levels: list[Level] = []
     for kernel in kernels:
         lattice = Lattice.covering(region, kernel, lattice_spacing * kernel)
@@ -315,6 +335,7 @@ def refine(cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shr
         total += level.blend(*places)[:, :3]
     planes = finest.planes.copy()
     planes[:3] = total.T.reshape(3, *finest.lattice.shape)
+    planes[0] += height
     planes[4] = planes[4] > 0.0
     return Level(finest.lattice, planes)
 

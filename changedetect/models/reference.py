@@ -80,7 +80,7 @@ class ReferenceSettings:
     prune_threshold: Annotated[float, Field(gt=0, le=1)] = 1.0
     initial_kernel_m: Annotated[float, Field(gt=0)] | None = None
     initial_distance_metric: tuple[tuple[float, float], tuple[float, float]] | None = None
-    observations_per_field: Annotated[float, Field(gt=0)] = 16.0
+    observations_per_field: Annotated[float, Field(gt=0)] = 20.0
     initial_forgetting_factor: Annotated[float, Field(gt=0, le=1)] = 0.99
     final_forgetting_factor: Annotated[float, Field(gt=0, le=1)] = 0.999
     forgetting_annealing: Annotated[float, Field(ge=0, le=1)] = 0.9995
@@ -302,10 +302,16 @@ class ReferenceLWPR:
         Returns
         -------
         n_observed : array, shape (n,)
-            Activation mass that the answering fields received in this epoch, each weighted by its activation at the
-            place; 0 where none answers. Below about 1 the surface there is inherited, or extrapolated.
+            Twice the activation mass that the answering fields received in this epoch, each weighted by its
+            activation at the place; 0 where none answers. Below about 2 the surface there is inherited, or
+            extrapolated.
+
+        Notes
+        -----
+        For evenly spread points (sum w)^2 / sum w^2 is 2 sum w. The sum is taken because it tells the difference that
+        the ratio does not: a few points at the far rim of a field count for next to nothing.
         """
-        return self._answer(coordinates).n_epoch
+        return 2.0 * self._answer(coordinates).n_epoch
 
     @property
     def region(self) -> Region:

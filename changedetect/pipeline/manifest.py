@@ -13,6 +13,7 @@ from contextvars import ContextVar
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import version
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -22,7 +23,7 @@ from changedetect.errors import ChangeDetectError, ModelStateError
 from changedetect.storage import read_json, write_json
 from changedetect.typing import JSONObject
 
-__all__ = ["RUN_FORMAT_VERSION", "RunManifest", "log_context", "new_run_id", "utc_now"]
+__all__ = ["RUN_FORMAT_VERSION", "RunManifest", "exit_code_of", "log_context", "new_run_id", "utc_now"]
 
 logger = logging.getLogger(__name__)
 
@@ -46,8 +47,8 @@ def utc_now() -> str:
 
 
 def new_run_id() -> str:
-    """Time and a few random digits; ids sort by time."""
-    return f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+    """Time to the microsecond and a few random digits: ids of one machine sort by time, even of runs a moment apart."""
+    return f"{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}-{secrets.token_hex(3)}"
 
 
 class RunManifest:
@@ -90,10 +91,11 @@ class RunManifest:
             "config_sha256": programme.config.config_sha256,
             "steps": [],
             "warnings": [],
+            "errors": [],
         }
 
     @property
-    def path(self) -> Any:
+    def path(self) -> Path:
         """Where the record lies."""
         return self.programme.runs_directory / f"{self.run_id}.json"
 
@@ -146,8 +148,7 @@ class RunManifest:
         except Exception as error:  # one failed epoch must not lose the others' results
             entry["status"] = "failed"
             entry["error"] = self._fail(error)
-            is_bug = not isinstance(error, ChangeDetectError)
-            logger.error("%s: %s", item.title, error, exc_info=is_bug)
+            logger.error("%s: %s", item.title, error, exc_info=exit_code_of(error) == 1)
         finally:
             _log_context.reset(context)
         entry |= {"seconds": round(perf_counter() - started, 3), **details}
@@ -160,11 +161,10 @@ class RunManifest:
         logger.warning("%s", message)
 
     def _fail(self, error: BaseException) -> JSONObject:
-        exit_code = error.exit_code if isinstance(error, ChangeDetectError) else 1
-        exit_code = 130 if isinstance(error, KeyboardInterrupt) else exit_code
+        exit_code = exit_code_of(error)
         self.exit_code = self.exit_code or exit_code
         described = {"class": type(error).__name__, "message": str(error), "exit_code": exit_code}
-        self._document.setdefault("errors", []).append(described)
+        self._document["errors"].append(described)
         return described
 
     def _finish(self, status: str, started: float) -> None:
@@ -179,9 +179,14 @@ class RunManifest:
     def _write(self) -> None:
         write_json(self.path, self._document)
 
-    def to_json(self) -> Mapping[str, Any]:
-        """Return the record as it stands on disk."""
-        return self._document
+
+def exit_code_of(error: BaseException) -> int:
+    """Exit code that an error ends the command line with; 1 stands for a bug."""
+    if isinstance(error, ChangeDetectError):
+        return error.exit_code
+    if isinstance(error, KeyboardInterrupt):
+        return 130
+    return 74 if isinstance(error, OSError) else 1
 
 
 def _close_killed_run(programme: Programme) -> None:

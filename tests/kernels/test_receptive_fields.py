@@ -75,18 +75,21 @@ def test_blended_planes_reproduce_a_plane_and_its_slope():
     np.testing.assert_allclose(blended[:, 3], 0.04, rtol=1e-12, atol=0.0)
 
 
-def test_blended_slope_is_the_derivative_of_the_blend():
-    rng = np.random.default_rng(2)
-    planes = rng.normal(size=(kernel.N_PLANE, 8, 8))
-    planes[3:5] = np.abs(planes[3:5]) + 0.1
-    level = Level(Lattice(1.0, 0.8, 0, 0, 8, 8), planes)
-    easting, northing = rng.uniform(2.0, 4.0, (2, 20))
-    step = 1e-6
-    east = (level.blend(easting + step, northing)[:, 0] - level.blend(easting - step, northing)[:, 0]) / (2 * step)
-    north = (level.blend(easting, northing + step)[:, 0] - level.blend(easting, northing - step)[:, 0]) / (2 * step)
-    blended = level.blend(easting, northing)
-    np.testing.assert_allclose(blended[:, 1], east, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(blended[:, 2], north, rtol=1e-5, atol=1e-6)
+def test_blend_answers_only_within_reach_of_a_field():
+    planes = np.zeros((kernel.N_PLANE, 4, 4))
+    planes[0], planes[4] = 7.0, 1.0
+    level = Level(Lattice(1.0, 0.8, 0, 0, 4, 4), planes)
+    blended = level.blend(np.array([1.6, 4.9]), np.array([1.6, 1.6]))
+    np.testing.assert_array_equal(blended[:, 7], [1.0, 0.0])
+    np.testing.assert_allclose(blended[:, 0], [7.0, 0.0], rtol=1e-12, atol=0.0)
+
+
+def test_better_fields_weigh_more_in_the_blend():
+    planes = np.zeros((kernel.N_PLANE, 1, 2))
+    planes[0] = [[0.0, 1.0]]
+    planes[4] = [[1.0, 3.0]]
+    middle = Level(Lattice(1.0, 1.0, 0, 0, 1, 2), planes).blend(np.array([1.0]), np.array([0.5]))
+    np.testing.assert_allclose(middle[0, 0], 0.75, rtol=1e-12, atol=0.0)
 
 
 def test_pooled_noise_ignores_a_minority_of_rough_fields():
@@ -102,35 +105,46 @@ def test_pooled_noise_ignores_a_minority_of_rough_fields():
     np.testing.assert_allclose(pooled[:, :5], 0.01, rtol=0.35, atol=0.0)
 
 
-def test_information_is_the_squared_distance_from_zero_in_standard_deviations():
-    fits = np.zeros((1, 2, kernel.N_FIT))
-    covariance = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.2], [-0.1, 0.2, 0.5]])
-    beta = np.array([1.0, -2.0, 0.5])
-    fits[0, 0, :3], fits[0, 0, 3:9] = beta, covariance[np.triu_indices(3)]
-    fits[0, 0, 9] = fits[0, 0, 10] = 10.0
-    information = np.empty((1, 2))
-    kernel.plane_information(fits, 4.0, 1e9, information)
-    np.testing.assert_allclose(information[0, 0], beta @ np.linalg.solve(covariance, beta), rtol=1e-12, atol=0.0)
-    assert information[0, 1] == -1.0
-
-
-def test_planes_are_shrunk_by_their_information():
-    fits = np.zeros((1, 3, kernel.N_FIT))
-    fits[..., 0], fits[..., 3] = 0.4, 0.01
+def _fits_of_one_plane(value, covariance):
+    fits = np.zeros((1, 1, kernel.N_FIT))
+    fits[0, 0, :3], fits[0, 0, 3:9] = value, covariance[np.triu_indices(3)]
     fits[..., 9] = fits[..., 10] = fits[..., 12] = 20.0
     fits[..., 11], fits[..., 15] = 20.0, 100.0
-    base = np.stack([np.full((1, 3), 0.001), np.ones((1, 3))])
-    planes = np.zeros((kernel.N_PLANE, 1, 3))
-    information = np.array([[2.0, 6.0, 3000.0]])
-    kernel.shrink_planes(fits, base, information, np.zeros((1, 3)), 1.0, 1.0, planes)
-    np.testing.assert_allclose(planes[8, 0], [0.0, 0.5, 0.999], rtol=1e-12, atol=0.0)
-    np.testing.assert_allclose(planes[0, 0], [0.0, 0.2, 0.3996], rtol=1e-12, atol=0.0)
-    np.testing.assert_allclose(planes[3, 0], [0.001, 0.0055, 0.009991], rtol=1e-12, atol=0.0)
+    return fits
+
+
+def _shrunk(fits, prior, coarse_variance=0.001, detail=0.0):
+    base = np.stack([np.full((1, 1), coarse_variance), np.ones((1, 1))])
+    planes = np.zeros((kernel.N_PLANE, 1, 1))
+    kernel.shrink_planes(fits, base, np.reshape(prior, (2, 1, 1)), np.full((1, 1), detail), 1.0, 4.0, planes)
+    return planes[:, 0, 0]
+
+
+def test_a_shrunk_plane_is_the_posterior_mean():
+    covariance = np.array([[0.02, 0.003, -0.001], [0.003, 0.01, 0.002], [-0.001, 0.002, 0.05]])
+    beta = np.array([0.4, -0.2, 0.3])
+    prior = np.diag([0.05, 0.02, 0.02])
+    planes = _shrunk(_fits_of_one_plane(beta, covariance), (0.05, 0.02))
+    weight = prior @ np.linalg.inv(prior + covariance)
+    np.testing.assert_allclose(planes[:3], weight @ beta, rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(planes[8], weight[0, 0], rtol=1e-12, atol=0.0)
+    expected = (1.0 - weight[0, 0]) * 0.001 + weight[0, 0] * 0.02
+    np.testing.assert_allclose(planes[3], expected, rtol=1e-12, atol=0.0)
+
+
+def test_without_detail_around_nothing_is_added():
+    planes = _shrunk(_fits_of_one_plane(np.array([0.4, 0.1, 0.1]), 0.01 * np.eye(3)), (0.0, 0.0))
+    np.testing.assert_array_equal(planes[:3], 0.0)
+    assert planes[3] == 0.001
+
+
+def test_a_plane_is_taken_as_fitted_where_the_prior_is_infinite():
+    planes = _shrunk(_fits_of_one_plane(np.array([0.4, 0.1, -0.1]), 0.01 * np.eye(3)), (np.inf, np.inf))
+    np.testing.assert_allclose(planes[:3], [0.4, 0.1, -0.1], rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(planes[3], 0.01, rtol=1e-12, atol=0.0)
 
 
 def test_unseen_detail_adds_to_the_variance():
-    fits = np.zeros((1, 1, kernel.N_FIT))
-    base = np.stack([np.full((1, 1), 0.001), np.ones((1, 1))])
-    planes = np.zeros((kernel.N_PLANE, 1, 1))
-    kernel.shrink_planes(fits, base, np.full((1, 1), -1.0), np.full((1, 1), 0.04), 1.0, 1.0, planes)
-    np.testing.assert_allclose(planes[3, 0, 0], 0.041, rtol=1e-12, atol=0.0)
+    planes = _shrunk(np.zeros((1, 1, kernel.N_FIT)), (0.1, 0.1), detail=0.04)
+    np.testing.assert_allclose(planes[3], 0.041, rtol=1e-12, atol=0.0)
+    np.testing.assert_array_equal(planes[:3], 0.0)

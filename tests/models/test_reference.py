@@ -1,5 +1,7 @@
 """Reference mode as a surface model: accuracy, honesty, epochs, persistence."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -53,8 +55,9 @@ def test_surface_is_more_accurate_than_one_observation_and_says_so(model):
     assert 0.93 < np.mean(np.abs(error) < 1.96 * answer.elevation_std) <= 1.0
     assert np.median(answer.elevation_std) < NOISE
     np.testing.assert_allclose(np.median(answer.noise_std), NOISE, rtol=0.3, atol=0.0)
-    # the kernel was chosen for sixteen
-    assert 8.0 < np.median(answer.n_effective) < 20.0
+    # the kernel was chosen for twenty, of which forgetting leaves some
+    assert 10.0 < np.median(answer.n_effective) < 22.0
+    np.testing.assert_allclose(np.median(model.observed(at)), 20.0, rtol=0.3, atol=0.0)
     assert (answer.age_days == 0.0).all()
 
 
@@ -138,7 +141,7 @@ def test_a_step_over_observed_ground_is_not_attenuated(model):
         # little noise: the question is what the memory keeps back
         coordinates, elevation = survey(n=n, seed=4, noise=0.002, lift=0.5)
         after = model.copy().partial_fit(coordinates, elevation, survey_time=1100.0).predict(at)
-        exact = ReferenceLWPR(ReferenceSettings(initial_kernel_m=0.45)).fit(coordinates, elevation - 0.5).predict(at)
+        exact = ReferenceLWPR(ReferenceSettings(initial_kernel_m=0.5)).fit(coordinates, elevation - 0.5).predict(at)
         np.testing.assert_allclose(np.mean(after.elevation - exact.elevation), 0.5, rtol=0.0, atol=tolerance)
         assert np.median(after.noise_std) < 1.5 * np.median(before.noise_std)  # the way up is not noise
 
@@ -167,7 +170,7 @@ def test_ground_that_is_not_seen_again_stays_and_ages(model):
     assert (later.observed(at)[unseen] == 0.0).all()
     np.testing.assert_allclose(after.elevation[seen] - before.elevation[seen], -1.0, rtol=0.0, atol=0.25)
     assert (after.age_days[seen] == 0.0).all()
-    assert (later.observed(at)[seen] > 1.0).all()
+    assert (later.observed(at)[seen] > 2.0).all()
     # a third epoch remembers when each place was seen last
     third = later.copy().partial_fit((easting[west], northing[west]), elevation[west], survey_time=1400.0)
     assert (third.predict(at).age_days[unseen] == 400.0).all()
@@ -302,8 +305,9 @@ def test_an_initial_metric_can_be_given():
 
 
 def test_the_section_of_a_programme_gives_the_settings():
-    fitted = ReferenceLWPR(LWPRConfig(activation_threshold=0.3, initial_kernel_m=2.0))
-    assert fitted.settings == ReferenceSettings(activation_threshold=0.3, initial_kernel_m=2.0)
+    section = LWPRConfig(activation_threshold=0.3, initial_kernel_m=2.0)
+    assert ReferenceLWPR(section).settings == ReferenceSettings(**asdict(section))
+    assert ReferenceLWPR(section).settings.activation_threshold == 0.3
 
 
 @pytest.mark.parametrize(

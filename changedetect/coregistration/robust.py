@@ -1,0 +1,161 @@
+"""Weights that let unchanged ground decide, however the rest changed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from changedetect.coregistration.squares import Squares
+    from changedetect.typing import BoolArray, FloatArray
+
+__all__ = ["Consensus", "nmad", "shortest_half", "weigh"]
+
+#: Tukey's biweight in scales: 95 % efficient for normal errors.
+_TUKEY = 4.685
+#: A square whose mean residual is further away than this many scales of such means has changed. Wide enough that of
+#: normal errors nothing worth mentioning is cut off, so that their spread is not underestimated.
+_CHANGED = 4.5
+#: Smallest scale, m: far below any survey's noise, it keeps noise-free data from dividing by zero.
+_SMALLEST_SCALE = 1e-6
+#: Standard deviation of a normal variable over its median absolute deviation.
+_NMAD = 1.4826
+
+
+def nmad(values: FloatArray) -> float:
+    """
+    Normalised median absolute deviation about the median.
+
+    Parameters
+    ----------
+    values : array, shape (n,)
+
+    Returns
+    -------
+    nmad : float
+        The standard deviation where values are normal; NaN where there are none.
+    """
+    if values.size == 0:
+        return float("nan")
+    return _NMAD * float(np.median(np.abs(values - np.median(values))))
+
+
+def shortest_half(values: FloatArray) -> float:
+    """
+    Median of the half of the values that lies closest together.
+
+    Stays with the majority where up to almost half of the values lie elsewhere, all on one side even, which
+    displaces the median.
+
+    Parameters
+    ----------
+    values : array, shape (n,)
+        At least one.
+
+    References
+    ----------
+    .. [1] P. J. Rousseeuw (1984), Least median of squares regression, J. Am. Stat. Assoc. 79, 871-880.
+    """
+    ordered = np.sort(values)
+    half = ordered.size // 2 + 1
+    first = int(np.argmin(ordered[half - 1 :] - ordered[: ordered.size - half + 1]))
+    return float(np.median(ordered[first : first + half]))
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """
+    Which observations agree, and how well.
+
+    Attributes
+    ----------
+    weight : array, shape (n,)
+        psi(r) / r of the biweight, 0 for outliers and on changed ground.
+    derivative : array, shape (n,)
+        psi'(r).
+    is_stable : array, shape (n_squares,), bool
+        Squares whose ground did not change.
+    scale : float, m
+        Robust standard deviation of an observation's residual.
+    square_scale : float, m
+        The same of a square's mean residual.
+    """
+
+    weight: FloatArray
+    derivative: FloatArray
+    is_stable: BoolArray
+    scale: float
+    square_scale: float
+
+    def stable_observations(self, squares: Squares) -> BoolArray:
+        """Whether each observation lies on ground that did not change."""
+        stable: BoolArray = self.is_stable[squares.member]
+        return stable
+
+
+def weigh(
+    residual: FloatArray,
+    defined: BoolArray,
+    precision: FloatArray,
+    squares: Squares,
+    before: Consensus | None,
+    *,
+    is_settled: bool = False,
+) -> Consensus:
+    """
+    One step towards the observations that agree with the reference.
+
+    Parameters
+    ----------
+    residual : array, shape (n,), m
+    defined : array, shape (n,), bool
+        Where the reference has an elevation.
+    precision : array, shape (n,)
+        1 / variance of an observation, relative to the typical one.
+    squares : Squares
+        Small enough to tell changed from unchanged ground, large enough to average noise.
+    before : Consensus or None
+        Of the step before; None in the first.
+    is_settled : bool
+        Keep the scales and the changed squares of the step before, and weigh anew with these.
+
+    Returns
+    -------
+    consensus : Consensus
+
+    Notes
+    -----
+    Two stages. Observations far from the surface (vegetation, gross errors) get less weight by Tukey's biweight; its
+    scale is the NMAD about zero of those not rejected in the step before, which shrinks to that of the unchanged
+    ground although changed ground inflates the first one. Then squares whose mean is far off are left out whole:
+    a change that is small against the noise of one observation shows in the mean of several.
+    """
+    root = np.sqrt(precision)
+    if before is None:
+        usable, stable_before = defined, np.ones(len(squares), dtype=np.bool_)
+    else:
+        stable_before = before.is_stable
+        usable = defined & (before.weight > 0.0) & stable_before[squares.member]
+    if is_settled and before is not None:
+        scale = before.scale
+    else:
+        scale = max(_NMAD * _median(np.abs(residual * root)[usable]), _SMALLEST_SCALE)
+    u2 = np.where(defined, (residual * root / (_TUKEY * scale)) ** 2, 1.0)
+    inside = np.maximum(1.0 - u2, 0.0)
+    weight = inside**2 * precision
+    derivative = inside * (1.0 - 5.0 * u2) * precision
+    if is_settled and before is not None:
+        stable, square_scale = stable_before, before.square_scale
+    else:
+        means = squares.mean(np.where(defined, residual, 0.0), weight)
+        judged = stable_before & np.isfinite(means)
+        square_scale = max(_NMAD * _median(np.abs(means[judged])), _SMALLEST_SCALE)
+        stable = np.abs(np.where(np.isfinite(means), means, np.inf)) <= _CHANGED * square_scale
+    kept = stable[squares.member]
+    return Consensus(np.where(kept, weight, 0.0), np.where(kept, derivative, 0.0), stable, scale, square_scale)
+
+
+def _median(values: FloatArray) -> float:
+    return float(np.median(values)) if values.size else 0.0
