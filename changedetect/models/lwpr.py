@@ -341,7 +341,7 @@ class LWPRSurface:
     def _inherit(self, parent: Self | None) -> None:
         """Take over the memory and the kernel bank of the epoch before."""
         self.__dict__.pop("_built", None)
-        finest = self.own_kernel_ * _FINEST_LEVEL
+        finest = max(self.own_kernel_ * _FINEST_LEVEL, min(self.own_kernel_, self.resolution or 0.0))
         self.memory_ = None
         self.memory_kernel_ = self.own_kernel_
         if parent is not None:

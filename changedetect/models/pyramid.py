@@ -320,14 +320,18 @@ def refine(cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shr
         raise ValueError(msg)
     region = cells.region
     cells, height = cells.centred()
+    sizes = CellPyramid(cells)
     levels: list[Level] = []
+    left, n_removed = cells, 0
     for kernel in kernels:
+        suited = sizes.for_kernel(kernel)
+        if suited.cell_size != left.cell_size or not levels:
+            left, n_removed = suited, 0
+        for level in levels[n_removed:]:
+            left = left.with_surface_removed(level.blend(*left.places))
+        n_removed = len(levels)
         lattice = Lattice.covering(region, kernel, lattice_spacing * kernel)
-        levels.append(
-            build_level(CellPyramid(cells).for_kernel(kernel), lattice, shrinkage, levels[-1] if levels else None)
-        )
-        if kernel != kernels[-1]:
-            cells = cells.with_surface_removed(levels[-1].blend(*cells.places))
+        levels.append(build_level(left, lattice, shrinkage, levels[-1] if levels else None))
     finest = levels[-1]
     places = finest.lattice.centres()
     total = np.zeros((places[0].size, 3))

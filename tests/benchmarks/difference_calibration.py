@@ -1,0 +1,74 @@
+"""
+False positives and power of the difference on scenes with known change and independent noise of 5 cm.
+
+Run: python tests/benchmarks/difference_calibration.py [--seeds 5]
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from changedetect.config import DifferencingConfig  # noqa: E402
+from changedetect.differencing import difference_models  # noqa: E402
+from changedetect.grid import Grid  # noqa: E402
+from changedetect.models.lwpr import LWPRSurface  # noqa: E402
+from changedetect.synthetic import benchmark_points  # noqa: E402
+
+MARGIN = {2.5: 4.2, 9.0: 2.1, 100.0: 1.6}  # m, more than the radius of a field of the difference
+
+
+def draw(density: float, seed: int):
+    """Share flagged and z where nothing changed; (height, power, mean change) of every patch."""
+    earlier, later = benchmark_points(seed, density=density)
+    models = [
+        LWPRSurface(resolution=0.25).fit((s.cloud.easting, s.cloud.northing), s.cloud.elevation)
+        for s in (earlier, later)
+    ]
+    scene = earlier.scene
+    grid = Grid.from_region(scene.region, 0.5, scene.crs)
+    maps = difference_models(*models, grid, DifferencingConfig())
+    easting, northing = grid.coordinates()
+    label = scene.change_labels(easting, northing, margin=MARGIN[density]).reshape(grid.shape)
+    inner = np.zeros(grid.shape, bool)
+    rim = int(np.ceil(MARGIN[density] / grid.resolution))
+    inner[rim:-rim, rim:-rim] = True
+    flagged = (maps.change_class == 1) | (maps.change_class == 2)
+    stable = inner & (label == 0) & np.isfinite(maps.dod)
+    truth = scene.change(easting, northing).reshape(grid.shape)
+    patches = []
+    for k in range(1, label.max() + 1):
+        cells = (label == k) & np.isfinite(maps.dod)
+        patches.append((round(float(truth[cells].mean()), 2), flagged[cells].mean(), maps.dod[cells].mean()))
+    return flagged[stable].mean(), maps.z_score[stable].std(), patches
+
+
+def main() -> None:
+    """Print one row per density."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=5)
+    n_seeds = parser.parse_args().seeds
+    for density in MARGIN:
+        false, spread, power, mean = [], [], {}, {}
+        for seed in range(n_seeds):
+            share, z, patches = draw(density, seed)
+            false.append(share)
+            spread.append(z)
+            for height, found, change in patches:
+                power.setdefault(height, []).append(found)
+                mean.setdefault(height, []).append(change)
+        print(
+            f"{density:6.1f} points/m2  false positives {100 * np.mean(false):.1f} % (from {100 * min(false):.1f} to "
+            f"{100 * max(false):.1f})  sd of z {np.mean(spread):.2f}"
+        )
+        for height in sorted(power):
+            print(
+                f"        {height:+.2f} m: found {100 * np.mean(power[height]):5.1f} %, mean {np.mean(mean[height]):+.4f} m"
+            )
+
+
+if __name__ == "__main__":
+    main()
