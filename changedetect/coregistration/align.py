@@ -95,9 +95,7 @@ def align(
     return alignment
 
 
-def _overlapping(
-    cloud: PointCloud, reference: ReferenceSurface, settings: AlignmentSettings
-) -> tuple[Sample, float]:
+def _overlapping(cloud: PointCloud, reference: ReferenceSurface, settings: AlignmentSettings) -> tuple[Sample, float]:
     """Sample of the observations on the reference, and the share these are."""
     defined = reference.surface(*cloud.coordinates).defined
     check_overlap(cloud, defined, reference, settings)

@@ -252,9 +252,7 @@ class _State:
     slopes_at: Transform
 
 
-def _advance(
-    state: _State, sample: Sample, reference: ReferenceSurface, *, is_judging: bool
-) -> tuple[_State, float]:
+def _advance(state: _State, sample: Sample, reference: ReferenceSurface, *, is_judging: bool) -> tuple[_State, float]:
     """One Gauss-Newton step, and how far it moved a position at the radius of the sample, m."""
     transform = state.transform
     misfit = measure(sample, reference, transform)

@@ -61,9 +61,7 @@ class Instruments:
     smoothing: float | None
 
     @classmethod
-    def at(
-        cls, sample: Sample, reference: ReferenceSurface, transform: Transform, smoothing: float | None
-    ) -> Self:
+    def at(cls, sample: Sample, reference: ReferenceSurface, transform: Transform, smoothing: float | None) -> Self:
         """Take slopes at the positions a transform gives the sample."""
         easting, northing, _ = transform.apply(*sample.cloud.coordinates, sample.cloud.elevation)
         h = reference.reach

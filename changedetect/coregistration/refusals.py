@@ -10,7 +10,7 @@ from changedetect.coregistration.robust import nmad
 from changedetect.errors import InputDataError
 
 if TYPE_CHECKING:
-    from changedetect.coregistration.estimation import Fit, Misfit
+    from changedetect.coregistration.estimation import Fit
     from changedetect.coregistration.sample import Sample
     from changedetect.coregistration.settings import AlignmentSettings
     from changedetect.coregistration.surfaces import ReferenceSurface

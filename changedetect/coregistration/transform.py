@@ -80,9 +80,7 @@ class Transform:
             msg = f"The kind of a transform is one of {', '.join(KINDS)}; got {self.kind!r}."
             raise ValueError(msg)
         if len(self.parameters) != len(self.names):
-            msg = (
-                f"A transform of kind {self.kind!r} has {len(self.names)} parameters; got {len(self.parameters)}."
-            )
+            msg = f"A transform of kind {self.kind!r} has {len(self.names)} parameters; got {len(self.parameters)}."
             raise ValueError(msg)
 
     @classmethod

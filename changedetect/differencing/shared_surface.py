@@ -16,7 +16,17 @@ from scipy.ndimage import uniform_filter
 
 from changedetect.kernels.receptive_fields import N_PLANE
 from changedetect.models.cells import merge_cells
-from changedetect.models.pyramid import CENTROID_LIMIT, N_MINIMUM, CellPyramid, Lattice, Level, build_level, fit_lattice
+from changedetect.models.pyramid import (
+    CENTROID_LIMIT,
+    N_MINIMUM,
+    SUPPORT_KERNELS,
+    CellPyramid,
+    Lattice,
+    Level,
+    build_level,
+    fit_lattice,
+    support,
+)
 
 if TYPE_CHECKING:
     from changedetect.models.cells import Cells
@@ -31,6 +41,10 @@ _ROUNDS = 3
 _SHARED_KERNEL = 2.0**0.5
 #: Kernel of d in the finest the thinner epoch supports.
 _CHANGE_KERNEL = 2.0**1.5
+#: The same at the edges of change.
+_EDGE_KERNEL = 2.0**0.5
+#: Standard deviations by which a wide and a narrow estimate must differ to count as an edge.
+_CONTRADICTION = 3.0
 #: Area over which a field averages, in squared kernels: n_eff = 20/9 pi h2 per unit density for the bisquare kernel.
 FIELD_AREA = 20.0 / 9.0 * np.pi
 _SPACING = 0.8
@@ -59,6 +73,14 @@ class LocalDifference:
     counts: tuple[FloatArray, FloatArray]
     observed: tuple[BoolArray, BoolArray]
     kernel: float
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    difference: FloatArray
+    variance: FloatArray
+    freedom: FloatArray
+    counts: tuple[FloatArray, FloatArray]
 
 
 def _joint_region(earlier: Cells, later: Cells) -> Region:
@@ -131,26 +153,69 @@ def estimate_difference(
         shared = _surface(merge_cells([earlier, moved]), region, fine)
         left = (_without(earlier, shared), _without(later, shared))
         change = _change(*left, region, wide)
-    output = Lattice(wide, lattice.spacing, lattice.first_row, lattice.first_column, *lattice.shape)
-    fits = [fit_lattice(CellPyramid(cells).for_kernel(wide), output) for cells in left]
-    reach = max(3, round(4.0 * wide / lattice.spacing) | 1)
+    return _sharpened(
+        _estimate(left, wide, lattice),
+        _estimate(left, _EDGE_KERNEL * max(kernels), lattice),
+        (_is_surrounded(earlier, kernels[0], lattice), _is_surrounded(later, kernels[1], lattice)),
+        wide,
+    )
+
+
+def _estimate(left: tuple[Cells, Cells], kernel: float, lattice: Lattice) -> _Estimate:
+    """Difference of the local planes of what two epochs leave over, with one kernel for both."""
+    output = Lattice(kernel, lattice.spacing, lattice.first_row, lattice.first_column, *lattice.shape)
+    fits = [fit_lattice(CellPyramid(cells).for_kernel(kernel), output) for cells in left]
+    reach = max(3, round(4.0 * kernel / lattice.spacing) | 1)
     variances, freedoms = zip(*(_value_variance(fit, reach) for fit in fits), strict=True)
     variance = variances[0] + variances[1]
     with np.errstate(divide="ignore", invalid="ignore"):
         freedom = variance**2 / (variances[0] ** 2 / freedoms[0] + variances[1] ** 2 / freedoms[1])
+    usable = (fits[0][..., 10] >= N_MINIMUM) & (fits[1][..., 10] >= N_MINIMUM)
+    return _Estimate(
+        np.where(usable, fits[1][..., 0] - fits[0][..., 0], np.nan),
+        variance,
+        freedom,
+        (fits[0][..., 10], fits[1][..., 10]),
+    )
+
+
+def _sharpened(
+    wide: _Estimate, narrow: _Estimate, observed: tuple[BoolArray, BoolArray], kernel: float
+) -> LocalDifference:
+    """
+    The wide estimate, but the narrow one where the two contradict each other: at the edges of change.
+
+    The wide kernel's data hold the narrow one's, so the variance of their difference is about the difference of their
+    variances; beyond three standard deviations of it the wide kernel has smeared an edge (Lepski's rule).
+    """
+    spread = np.maximum(narrow.variance - wide.variance, 0.0)
+    with np.errstate(invalid="ignore"):
+        is_edge = (narrow.difference - wide.difference) ** 2 > _CONTRADICTION**2 * spread
+    is_edge &= np.isfinite(narrow.difference)
+
+    def chosen(a: FloatArray, b: FloatArray) -> FloatArray:
+        return np.where(is_edge, a, b)
+
     return LocalDifference(
-        difference=fits[1][..., 0] - fits[0][..., 0],
-        variance=variance,
-        freedom=freedom,
-        counts=(fits[0][..., 10], fits[1][..., 10]),
-        observed=(_is_observed(fits[0]), _is_observed(fits[1])),
-        kernel=wide,
+        difference=chosen(narrow.difference, wide.difference),
+        variance=chosen(narrow.variance, wide.variance),
+        freedom=chosen(narrow.freedom, wide.freedom),
+        counts=(chosen(narrow.counts[0], wide.counts[0]), chosen(narrow.counts[1], wide.counts[1])),
+        observed=observed,
+        kernel=kernel,
     )
 
 
 def _is_observed(fits: FloatArray) -> BoolArray:
     observed: BoolArray = (fits[..., 10] >= N_MINIMUM) & (fits[..., 13] <= CENTROID_LIMIT)
     return observed
+
+
+def _is_surrounded(cells: Cells, finest: float, lattice: Lattice) -> BoolArray:
+    """Where an epoch's observations surround a place closely, by the same rule as for its surface."""
+    kernel = SUPPORT_KERNELS * finest
+    surrounded: BoolArray = support(CellPyramid(cells).for_kernel(kernel), lattice, kernel)[0] > 0.0
+    return surrounded
 
 
 def _value_variance(fits: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:

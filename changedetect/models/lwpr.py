@@ -18,7 +18,7 @@ from changedetect.config import AdaptiveConfig
 from changedetect.models.base import Prediction
 from changedetect.models.cells import Cells, Evidence, merge_cells
 from changedetect.models.lwpr_state import read_state, write_state
-from changedetect.models.pyramid import CellPyramid, Level, noise_variance, refine, scale_bank, support
+from changedetect.models.pyramid import SUPPORT_KERNELS, CellPyramid, Level, noise_variance, refine, scale_bank, support
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,8 +38,6 @@ _N_STEPS = 9
 _CHANGE_SHRINKAGE = 2.0
 #: Spacing, in kernels, of the places where the noise is estimated: neighbours share little data.
 _NOISE_SPACING = 1.6
-#: Kernel, in finest kernels, within which observations must surround a place for an answer there.
-SUPPORT_KERNELS = 2.0
 
 
 @dataclass(frozen=True)

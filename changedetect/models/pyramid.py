@@ -35,6 +35,8 @@ _SURFACE_REACH = 1.5
 N_MINIMUM = 4.0
 #: A field whose observations' centroid lies further from its centre than this many kernels extrapolates.
 CENTROID_LIMIT = 0.75
+#: Kernel, in the finest kernels an epoch's density supports, within which observations must surround a place.
+SUPPORT_KERNELS = 2.0
 #: Lattice steps over which the noise variance is pooled.
 NOISE_REACH = 3
 #: Lattice steps over which the typical detail of a level is averaged.

@@ -12,11 +12,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from changedetect.config import DifferencingConfig  # noqa: E402
-from changedetect.differencing import difference_models  # noqa: E402
-from changedetect.grid import Grid  # noqa: E402
-from changedetect.models.lwpr import LWPRSurface  # noqa: E402
-from changedetect.synthetic import benchmark_points  # noqa: E402
+from changedetect.config import DifferencingConfig
+from changedetect.differencing import difference_models
+from changedetect.grid import Grid
+from changedetect.models.lwpr import LWPRSurface
+from changedetect.synthetic import benchmark_points
 
 MARGIN = {2.5: 4.2, 9.0: 2.1, 100.0: 1.6}  # m, more than the radius of a field of the difference
 

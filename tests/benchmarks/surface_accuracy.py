@@ -16,9 +16,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from changedetect.models.comparators import comparators  # noqa: E402
-from changedetect.models.lwpr import LWPRSurface  # noqa: E402
-from changedetect.synthetic import trees_scene  # noqa: E402
+from changedetect.models.comparators import comparators
+from changedetect.models.lwpr import LWPRSurface
+from changedetect.synthetic import trees_scene
 
 PEERS = {40_000: "kriging", 2_500: "gpr_matern32"}
 

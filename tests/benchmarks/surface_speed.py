@@ -15,8 +15,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from changedetect.models.lwpr import LWPRSurface  # noqa: E402
-from changedetect.synthetic import benchmark_points  # noqa: E402
+from changedetect.models.lwpr import LWPRSurface
+from changedetect.synthetic import benchmark_points
 
 
 def measure(density: float, repeats: int) -> tuple[float, float, float, float]:

@@ -103,3 +103,17 @@ def test_ground_only_one_epoch_saw_is_not_observed():
     assert result.observed[0][:, 2:-2].mean() > 0.99
     assert not result.observed[1][x > 27.0].any()
     assert result.observed[1][(x > 1.0) & (x < 23.5)].mean() > 0.99
+
+
+def test_an_edge_of_change_stays_sharp_and_unbiased_close_by():
+    def block(x, y):
+        return np.where((np.abs(x - 25.0) < 4.0) & (np.abs(y - 25.0) < 4.0), 0.5, 0.0)
+
+    result = difference(epoch(9.0, 81), epoch(9.0, 82, block))
+    x, y = centres()
+    inside = (np.abs(x - 25.0) < 2.5) & (np.abs(y - 25.0) < 2.5)
+    np.testing.assert_allclose(result.difference[inside].mean(), 0.5, rtol=0.02, atol=0.0)
+    row = result.difference[np.abs(y[:, 0] - 25.0) < 2.0].mean(axis=0)
+    west = x[0] < 25.0
+    rise = np.interp([0.05, 0.45], row[west], x[0][west])
+    assert rise[1] - rise[0] < 2.0
