@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from changedetect.coregistration.instruments import Instruments
-from changedetect.coregistration.robust import Consensus, shortest_half, weigh
+from changedetect.coregistration.robust import CHANGED, CHANGED_AT_FIRST, Consensus, shortest_half, weigh
 from changedetect.coregistration.uncertainty import Scores, parameter_covariance
 
 if TYPE_CHECKING:
@@ -23,8 +23,9 @@ __all__ = ["Fit", "Misfit", "Solution", "assess", "best_smoothing", "length_scal
 #: Largest motion of a position in the last iteration, m.
 _TOLERANCE = 1e-5
 _MAX_ITERATIONS = 40
-#: Iterations in which scales and changed squares are judged anew; from then on they stay.
-_N_JUDGING = 6
+#: Iterations in which changed squares are judged sharply, and until which they are judged at all; then they stay.
+_N_SHARP = 4
+_N_JUDGING = 8
 #: A step is not longer than this many reaches of the reference.
 _LONGEST_STEP = 4.0
 #: Smoothers that are tried, standard deviations in squares.
@@ -194,13 +195,11 @@ def solve(
     )
     iteration, is_converged = 0, False
     while not is_converged and iteration < _MAX_ITERATIONS:
-        state, moved = _advance(state, sample, reference, is_judging=iteration < _N_JUDGING)
+        state, moved = _advance(state, sample, reference, iteration)
         iteration += 1
-        is_converged = iteration > 1 and moved < _TOLERANCE
+        is_converged = iteration > _N_SHARP + 1 and moved < _TOLERANCE
     misfit = measure(sample, reference, state.transform)
-    consensus = weigh(
-        misfit.residual, misfit.defined, sample.precision, sample.squares, state.consensus, is_settled=True
-    )
+    consensus = weigh(misfit.residual, misfit.defined, sample.precision, sample.squares, state.consensus, None)
     return Solution(state.transform, misfit, consensus, state.instruments, iteration, is_converged)
 
 
@@ -252,13 +251,13 @@ class _State:
     slopes_at: Transform
 
 
-def _advance(state: _State, sample: Sample, reference: ReferenceSurface, *, is_judging: bool) -> tuple[_State, float]:
+def _advance(state: _State, sample: Sample, reference: ReferenceSurface, iteration: int) -> tuple[_State, float]:
     """One Gauss-Newton step, and how far it moved a position at the radius of the sample, m."""
     transform = state.transform
     misfit = measure(sample, reference, transform)
-    consensus = weigh(
-        misfit.residual, misfit.defined, sample.precision, sample.squares, state.consensus, is_settled=not is_judging
-    )
+    is_judging = iteration < _N_JUDGING
+    changed = (CHANGED_AT_FIRST if iteration < _N_SHARP else CHANGED) if is_judging else None
+    consensus = weigh(misfit.residual, misfit.defined, sample.precision, sample.squares, state.consensus, changed)
     taken, slopes_at = state.instruments, state.slopes_at
     drifted = float(np.hypot(*(transform.shift - slopes_at.shift)[:2])) > 0.5 * reference.reach
     if is_judging and drifted:

@@ -6,18 +6,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 if TYPE_CHECKING:
     from changedetect.coregistration.squares import Squares
     from changedetect.typing import BoolArray, FloatArray
 
-__all__ = ["Consensus", "nmad", "shortest_half", "weigh"]
+__all__ = ["CHANGED", "CHANGED_AT_FIRST", "Consensus", "nmad", "shortest_half", "weigh"]
 
 #: Tukey's biweight in scales: 95 % efficient for normal errors.
 _TUKEY = 4.685
-#: A square whose mean residual is further away than this many scales of such means has changed. Wide enough that of
-#: normal errors nothing worth mentioning is cut off, so that their spread is not underestimated.
-_CHANGED = 4.5
+#: A square whose mean residual is further away than this many scales of such means has changed: of normal errors
+#: 0.3 % are, which takes 1 % off their spread. At first it is fewer, because where 40 % of the ground changed to one
+#: side the scale that is seen is twice that of the unchanged ground.
+CHANGED = 3.0
+CHANGED_AT_FIRST = 2.0
 #: Smallest scale, m: far below any survey's noise, it keeps noise-free data from dividing by zero.
 _SMALLEST_SCALE = 1e-6
 #: Standard deviation of a normal variable over its median absolute deviation.
@@ -101,8 +104,7 @@ def weigh(
     precision: FloatArray,
     squares: Squares,
     before: Consensus | None,
-    *,
-    is_settled: bool = False,
+    changed: float | None,
 ) -> Consensus:
     """
     One step towards the observations that agree with the reference.
@@ -118,8 +120,8 @@ def weigh(
         Small enough to tell changed from unchanged ground, large enough to average noise.
     before : Consensus or None
         Of the step before; None in the first.
-    is_settled : bool
-        Keep the scales and the changed squares of the step before, and weigh anew with these.
+    changed : float or None
+        Scales beyond which a square has changed. None keeps the scales and the changed squares of the step before.
 
     Returns
     -------
@@ -134,27 +136,30 @@ def weigh(
     """
     root = np.sqrt(precision)
     if before is None:
-        usable, stable_before = defined, np.ones(len(squares), dtype=np.bool_)
+        usable, stable = defined, np.ones(len(squares), dtype=np.bool_)
     else:
-        stable_before = before.is_stable
-        usable = defined & (before.weight > 0.0) & stable_before[squares.member]
-    if is_settled and before is not None:
-        scale = before.scale
+        usable, stable = defined & (before.weight > 0.0), before.is_stable
+    if changed is None and before is not None:
+        scale, square_scale = before.scale, before.square_scale
     else:
         scale = max(_NMAD * _median(np.abs(residual * root)[usable]), _SMALLEST_SCALE)
     u2 = np.where(defined, (residual * root / (_TUKEY * scale)) ** 2, 1.0)
     inside = np.maximum(1.0 - u2, 0.0)
     weight = inside**2 * precision
     derivative = inside * (1.0 - 5.0 * u2) * precision
-    if is_settled and before is not None:
-        stable, square_scale = stable_before, before.square_scale
-    else:
-        means = squares.mean(np.where(defined, residual, 0.0), weight)
-        judged = stable_before & np.isfinite(means)
-        square_scale = max(_NMAD * _median(np.abs(means[judged])), _SMALLEST_SCALE)
-        stable = np.abs(np.where(np.isfinite(means), means, np.inf)) <= _CHANGED * square_scale
+    if changed is not None or before is None:
+        cut = changed or CHANGED
+        # squares without a single observation of any weight have no mean; they have changed
+        means = np.abs(np.nan_to_num(squares.mean(residual, weight), nan=np.inf))
+        square_scale = max(_median(means[stable]) / _truncated_median(cut), _SMALLEST_SCALE)
+        stable = means <= cut * square_scale
     kept = stable[squares.member]
     return Consensus(np.where(kept, weight, 0.0), np.where(kept, derivative, 0.0), stable, scale, square_scale)
+
+
+def _truncated_median(cut: float) -> float:
+    """Median of |x| for x normal with standard deviation one and |x| < cut."""
+    return float(ndtri(0.25 + 0.5 * ndtr(cut)))
 
 
 def _median(values: FloatArray) -> float:

@@ -28,7 +28,6 @@ __all__ = [
     "N_PLANE",
     "blend_planes",
     "fit_planes",
-    "plane_information",
     "pool_noise",
     "shrink_planes",
     "survey_support",

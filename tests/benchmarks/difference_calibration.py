@@ -65,9 +65,8 @@ def main() -> None:
             f"{100 * max(false):.1f})  sd of z {np.mean(spread):.2f}"
         )
         for height in sorted(power):
-            print(
-                f"        {height:+.2f} m: found {100 * np.mean(power[height]):5.1f} %, mean {np.mean(mean[height]):+.4f} m"
-            )
+            found, average = 100 * np.mean(power[height]), np.mean(mean[height])
+            print(f"        {height:+.2f} m: found {found:5.1f} %, mean {average:+.4f} m")
 
 
 if __name__ == "__main__":
