@@ -33,7 +33,7 @@ def local_plane(easting, northing, elevation, weight, centre, kernel):
     covariance = smoother @ np.diag(1.0 / weight) @ smoother.T
     residual = elevation - design @ beta
     total = activation * weight
-    n_effective = total.sum() ** 2 / np.sum(activation**2 * weight)
+    n_effective = total.sum() ** 2 / np.sum(total**2)
     # expectation of the weighted residual sum under unit variance factor
     hat = design @ smoother
     left = np.eye(len(x)) - hat

@@ -44,7 +44,8 @@ class AdaptiveConfig:
     cell_size_m : float or None, m
         Edge of the micro-cells whose moments are kept.
     kernel_min_m, kernel_max_m : float or None, m
-        Finest and coarsest kernel (standard deviation of the Gaussian) of the pyramid of receptive fields.
+        Kernel size the density of an epoch supports, and the coarsest kernel of the pyramid of receptive fields. The
+        kernel is LWPR's bisquare, which ends at twice this size.
     kernel_ratio : float
         Kernel of one level of the pyramid over that of the next finer one.
     lattice_spacing : float
@@ -52,10 +53,7 @@ class AdaptiveConfig:
     shrinkage : float
         Strength of the empirical-Bayes shrinkage of the local planes; 0 switches it off.
     prior_observations : float
-        Weight of the pooled noise variance in a young receptive field, as a number of observations.
-    outlier_threshold : float
-        Observations further than this many robust standard deviations from the consensus of their own epoch
-        are down-weighted; 0 switches it off.
+        What a micro-cell remembers of earlier epochs counts for at most this many observations.
     """
 
     cell_size_m: Annotated[float, Field(gt=0)] | None = None
@@ -64,8 +62,7 @@ class AdaptiveConfig:
     kernel_ratio: Annotated[float, Field(gt=1, lt=4)] = 1.4142
     lattice_spacing: Annotated[float, Field(gt=0, le=2)] = 0.8
     shrinkage: Annotated[float, Field(ge=0)] = 1.0
-    prior_observations: Annotated[float, Field(ge=0)] = 1.0
-    outlier_threshold: Annotated[float, Field(ge=0)] = 6.0
+    prior_observations: Annotated[float, Field(gt=0)] = 1.0
 
     def __post_init__(self) -> None:
         """Refuse an empty range of kernels."""

@@ -85,7 +85,7 @@ def align(
     vertical = solve(sample, reference, start)
     sample = _weighted(sample, vertical)
     if sample.cloud.sigma is not None or float(before.surface_variance.max(initial=0.0)) > 0.0:
-        vertical = solve(sample, reference, vertical.transform, None, vertical)
+        vertical = solve(sample, reference, vertical.transform)
     choice = choose(sample, reference, vertical, settings)
     check_effective(choice.fit, settings)
     alignment = _reported(choice, sample, before.residual, len(chosen), overlap, settings, stable is not None)

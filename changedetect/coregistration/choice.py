@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from changedetect.coregistration.alignment import Candidate
-from changedetect.coregistration.estimation import Fit, assess, best_smoothing, solve
+from changedetect.coregistration.estimation import FIRST_SMOOTHING, Fit, assess, best_smoothing, solve
 from changedetect.coregistration.refusals import undetermined
 from changedetect.coregistration.transform import KINDS
 from changedetect.errors import InputDataError
@@ -149,13 +149,13 @@ def _fitted(
     if kind == "vertical":
         return assess(before, sample), None
     if before.transform.kind == "vertical":
-        raw = solve(sample, reference, before.transform.promoted("shift"), None, before)
+        raw = solve(sample, reference, before.transform.promoted("shift"), FIRST_SMOOTHING)
         smoothing = best_smoothing(raw, sample)
-        before = solve(sample, reference, raw.transform, smoothing, raw) if smoothing is not None else raw
+        before = solve(sample, reference, raw.transform, smoothing) if smoothing != FIRST_SMOOTHING else raw
     solution = before
     if kind != "shift":
         smoothing = before.instruments.smoothing
-        solution = solve(sample, reference, before.transform.promoted(kind), smoothing, before)
+        solution = solve(sample, reference, before.transform.promoted(kind), smoothing)
     fit = assess(solution, sample)
     reason = undetermined(fit, sample, n_before, limit)
     logger.debug("%s: %s, standard errors %s", kind, fit.transform.parameters, np.sqrt(np.diag(fit.covariance)))

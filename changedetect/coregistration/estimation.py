@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from changedetect.coregistration.instruments import Instruments
-from changedetect.coregistration.robust import CHANGED, CHANGED_AT_FIRST, Consensus, shortest_half, weigh
+from changedetect.coregistration.robust import CHANGED, CHANGED_AT_FIRST, Consensus, majority_level, weigh
 from changedetect.coregistration.uncertainty import Scores, parameter_covariance
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from changedetect.coregistration.transform import Transform
     from changedetect.typing import BoolArray, FloatArray
 
-__all__ = ["Fit", "Misfit", "Solution", "assess", "best_smoothing", "length_scales", "measure", "solve"]
+__all__ = ["FIRST_SMOOTHING", "Fit", "Misfit", "Solution", "assess", "best_smoothing", "length_scales", "measure", "solve"]
 
 #: Largest motion of a position in the last iteration, m.
 _TOLERANCE = 1e-5
@@ -30,6 +30,8 @@ _N_JUDGING = 8
 _LONGEST_STEP = 4.0
 #: Smoothers that are tried, standard deviations in squares.
 _SMOOTHINGS = (1.0, 2.0, 4.0, 8.0)
+#: The one to begin with: large areas that changed do not pull on slopes less their mean over smaller ones.
+FIRST_SMOOTHING = 8.0
 #: A smoother must bring the variance of the horizontal shift below this part of that without it.
 _WORTHWHILE = 0.8
 #: Parameters that are lengths; the others become lengths at the radius of the sample.
@@ -155,7 +157,6 @@ def solve(
     reference: ReferenceSurface,
     start: Transform,
     smoothing: float | None = None,
-    before: Solution | None = None,
 ) -> Solution:
     """
     Fit a transform of one kind.
@@ -165,13 +166,9 @@ def solve(
     sample : Sample
     reference : ReferenceSurface
     start : Transform
-        Of the kind wanted.
+        Of the kind wanted; its elevation is first brought to that of the majority of the ground.
     smoothing : float or None
         See `Instruments`; chosen by `best_smoothing`.
-    before : Solution, optional
-        A solution near by, of any kind, whose consensus is started from. Without it the elevation is first brought
-        to that of the closest half of the residuals.
-
     Returns
     -------
     solution : Solution
@@ -182,17 +179,7 @@ def solve(
     Solves Z' psi(r(theta)) = 0 by Gauss-Newton steps: in each the residuals r, the reference's slope in the Jacobian
     J and the robust weights W are evaluated anew, and theta changes by -(Z' W J)^-1 Z' W r. For Z see `Instruments`.
     """
-    if before is None:
-        misfit = measure(sample, reference, start)
-        up = np.array([name == "up" for name in start.names], dtype=np.float64)
-        if misfit.defined.any():
-            start = start.stepped(-shortest_half(misfit.residual[misfit.defined]) * up)
-    state = _State(
-        start,
-        None if before is None else before.consensus,
-        Instruments.at(sample, reference, start, smoothing),
-        start,
-    )
+    state = _State(start, None, Instruments.at(sample, reference, start, smoothing), start)
     iteration, is_converged = 0, False
     while not is_converged and iteration < _MAX_ITERATIONS:
         state, moved = _advance(state, sample, reference, iteration)
@@ -255,12 +242,18 @@ def _advance(state: _State, sample: Sample, reference: ReferenceSurface, iterati
     """One Gauss-Newton step, and how far it moved a position at the radius of the sample, m."""
     transform = state.transform
     misfit = measure(sample, reference, transform)
-    is_judging = iteration < _N_JUDGING
-    changed = (CHANGED_AT_FIRST if iteration < _N_SHARP else CHANGED) if is_judging else None
-    consensus = weigh(misfit.residual, misfit.defined, sample.precision, sample.squares, state.consensus, changed)
+    if iteration < _N_SHARP:
+        # the level of the majority, found anew while the horizontal shift settles: misfit on slopes hides changes
+        level = majority_level(misfit.residual, misfit.defined, sample.precision, sample.squares)
+        transform = transform.stepped([-level if name == "up" else 0.0 for name in transform.names])
+        misfit = replace(misfit, residual=np.where(misfit.defined, misfit.residual - level, 0.0))
+        consensus = weigh(misfit.residual, misfit.defined, sample.precision, sample.squares, None, CHANGED_AT_FIRST)
+    else:
+        changed = CHANGED if iteration < _N_JUDGING else None
+        consensus = weigh(misfit.residual, misfit.defined, sample.precision, sample.squares, state.consensus, changed)
     taken, slopes_at = state.instruments, state.slopes_at
     drifted = float(np.hypot(*(transform.shift - slopes_at.shift)[:2])) > 0.5 * reference.reach
-    if is_judging and drifted:
+    if iteration < _N_JUDGING and drifted:
         taken, slopes_at = Instruments.at(sample, reference, transform, taken.smoothing), transform
     scales = length_scales(transform, sample.radius)
     instruments = taken.matrix(sample, transform) * scales

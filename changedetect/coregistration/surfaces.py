@@ -19,8 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["GridReference", "LWPRReference", "PredictedReference", "ReferenceSurface", "SurfaceValues"]
 
-#: Correlation of the errors of two places this many kernels apart is a few percent for the bisquare kernel.
-_REACH_KERNELS = 2.5
+#: The errors of two places this many of the finest kernels apart are correlated by less than a fifth: coarser levels
+#: decide where the finest see nothing but noise.
+_REACH_KERNELS = 4.0
 #: Nodes from a place beyond which bicubic interpolation at the two shares at most one, of small weight.
 _REACH_NODES = 3.0
 
@@ -73,8 +74,8 @@ class LWPRReference:
 
     @property
     def reach(self) -> float:
-        """Two and a half of the finest kernels, m."""
-        return _REACH_KERNELS * self.model.kernels_[-1]
+        """Four of the kernels that the density of the observations supports, m."""
+        return _REACH_KERNELS * self.model.own_kernel_
 
     def surface(self, easting: FloatArray, northing: FloatArray) -> SurfaceValues:
         """Evaluate at places of shape (n,), m."""
@@ -100,7 +101,7 @@ class PredictedReference:
 
     @property
     def reach(self) -> float:
-        """Two and a half kernels, m."""
+        """Four kernels, m."""
         return _REACH_KERNELS * self.kernel
 
     def surface(self, easting: FloatArray, northing: FloatArray) -> SurfaceValues:

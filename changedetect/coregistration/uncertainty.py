@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from changedetect.coregistration.correlated import fit_block_errors
+from changedetect.coregistration.robust import skipping_inflation
 
 if TYPE_CHECKING:
     from changedetect.coregistration.correlated import BlockErrors
@@ -102,6 +104,7 @@ def parameter_covariance(scores: Scores, guess: BlockErrors | None) -> tuple[Flo
     within_terms = within @ influence.T
     between_terms = between @ influence.T
     covariance = correction * within_terms.T @ within_terms
+    between_terms *= math.sqrt(skipping_inflation())
     covariance += between_terms.T @ errors.covariance(distance, dilution) @ between_terms
 
     # var(sum of a2) = 2 / 3 sum of a4 for normal terms a of known mean zero

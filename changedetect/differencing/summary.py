@@ -46,8 +46,8 @@ def summarise(maps: ChangeMaps, grid: Grid) -> JSONObject:
     Notes
     -----
     Volumes use the estimate of every cell, since keeping only significant cells biases them. Summing positive and
-    negative parts apart would count noise as both cut and fill: its expectation, std / sqrt(2 pi) for each cell below
-    the level of detection, is taken off both. Standard deviations hold the local noise alone: cells closer than
+    negative parts apart would count noise as both cut and fill: where no change was detected the smaller of the two
+    sums is taken for noise and off both. Standard deviations hold the local noise alone: cells closer than
     `maps.correlation_length` share their data, cells further apart count as independent.
     """
     area = grid.resolution**2
@@ -55,7 +55,7 @@ def summarise(maps: ChangeMaps, grid: Grid) -> JSONObject:
     classes = maps.change_class
     d, std = maps.dod[both], maps.dod_std[both]
     quiet = classes[both] == BELOW_LEVEL_OF_DETECTION
-    rectified = area * float(np.sum(std[quiet])) / math.sqrt(2.0 * math.pi)
+    rectified = area * float(min(np.sum(d[quiet & (d > 0.0)]), -np.sum(d[quiet & (d < 0.0)])))
     median = float(np.median(d)) if d.size else None
     return {
         "resolution_m": grid.resolution,

@@ -124,7 +124,7 @@ def fit_planes(
                     s3 += w * x3
                     s4 += w * x4
                     s5 += w * x5
-                    p0 += w * w * n
+                    p0 += w * w * n * n / m[0]
                     # weight times noise variance of this cell's observations: 1 where the weights are right
                     f = n * m[12] / (m[0] * m[0])
                     expected += w * m[0] * f

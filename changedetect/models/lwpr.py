@@ -435,8 +435,11 @@ class LWPRSurface:
         moments = cells.moments.copy()
         moments[:, 11] = moments[:, 1] * np.where(last[:, 7] > 0.0, last[:, 6], moments[:, 11] / moments[:, 1])
         fade = math.exp(-(time - self.survey_time_) / self.memory_days)
-        factor = fade * np.minimum(1.0, self.settings.prior_observations / (fade * moments[:, 0]))
-        return Cells(cells.cell_size, cells.row, cells.column, moments * factor[:, None])
+        # weights in observations; counts and noise variances stay, so that ground which is not seen again keeps the
+        # precision it was observed with while it counts for little beside new observations
+        observations = moments[:, 1] * moments[:, 12] / moments[:, 0]
+        factor = fade * np.minimum(1.0, self.settings.prior_observations / (fade * observations))
+        return Cells(cells.cell_size, cells.row, cells.column, moments).with_weights_scaled(factor)
 
 
 def _support_at(cells: Cells, level: Level, finest: float) -> FloatArray:

@@ -18,7 +18,7 @@ import xarray as xr
 
 from changedetect.config import AdaptiveConfig
 from changedetect.errors import ModelStateError
-from changedetect.kernels.moments import ELEVATION_UNIT, N_MOMENTS, N_SUMS, OFFSET_UNIT
+from changedetect.kernels.moments import ELEVATION_UNIT, N_MOMENTS, N_SUMS, OFFSET_UNIT, WEIGHT_UNIT
 from changedetect.models.cells import TILE_CELLS, Cells, Evidence
 from changedetect.storage import read_dataset, write_dataset
 
@@ -158,6 +158,14 @@ def _evidence_files(evidence: Evidence) -> dict[str, xr.Dataset]:
                 "cell_size": evidence.cell_size,
                 "tile_row": r,
                 "tile_column": c,
+                "tile_cells": _STORAGE_CELLS,
+                "cell_size_units": "m",
+                "comment": "cell row r (northwards) and column c (eastwards) of the tile has its south-west corner at "
+                "easting (tile_column * tile_cells + c) * cell_size, northing likewise, in the CRS of the programme; "
+                "offsets x, y from the cell centre are in units of cell_size * offset_unit_cells, elevations z in "
+                "units of elevation_unit_m about mean_elevation; w is 1 where it is not stored, else "
+                "1 / (sigma^2 * weight_unit_per_m2)",
+                "weight_unit_per_m2": WEIGHT_UNIT,
                 "offset_unit_cells": OFFSET_UNIT,
                 "elevation_unit_m": ELEVATION_UNIT,
             },
@@ -198,7 +206,15 @@ def _memory_files(memory: Cells | None) -> dict[str, xr.Dataset]:
                 "column": ("cell", memory.column[members].astype(np.int32)),
                 "moments": (("cell", "lane"), memory.moments[members]),
             },
-            attrs={"title": "remembered moments of earlier epochs, weights in 1/m2", "cell_size": memory.cell_size},
+            attrs={
+                "title": "remembered moments of earlier epochs about the cell centres",
+                "cell_size": memory.cell_size,
+                "cell_size_units": "m",
+                "lanes": "n w wx wy wxx wxy wyy wz wxz wyz wzz wt ns2",
+                "comment": "sums over observations: n count, w weight (1/m2), x y offset from the cell centre (m, east "
+                "and north), z elevation (m), t time (days since 1970-01-01), s2 noise variance (m2); rows and columns "
+                "count cells from the origin of the programme's CRS",
+            },
         )
     return files
 

@@ -12,7 +12,7 @@ import changedetect
 from changedetect.catalogue import ChangeProduct, ProductRecord, Programme, describe_files
 from changedetect.config import ProgrammeConfig
 from changedetect.differencing import difference_models, summarise
-from changedetect.errors import ModelStateError
+from changedetect.errors import ConfigError, ModelStateError
 from changedetect.grid import Grid
 from changedetect.io.netcdf import CHANGE_LAYERS, SURFACE_LAYERS
 from changedetect.io.products import (
@@ -44,6 +44,8 @@ SUMMARY_FILE = "summary.json"
 #: Version of the layout of `summary.json`.
 SUMMARY_FORMAT_VERSION = 1
 #: Cells predicted at a time, along each side.
+#: A raster of more cells is refused: 20 000 x 20 000.
+_MAX_CELLS = 4e8
 _BLOCK = 512
 #: Names the rasters have in `ChangeMaps` where they differ.
 _MAP_NAMES = {"n_observations_earlier": "n_effective_earlier", "n_observations_later": "n_effective_later"}
@@ -57,8 +59,29 @@ def product_grid(
 
     All grids of a resolution have their cell borders on its multiples, so that rasters of different epochs overlay
     cell by cell even where their extents differ.
+
+    Raises
+    ------
+    ConfigError
+        Resolution or bounds enclose nothing, or the raster would be too large to be meant.
     """
-    return Grid.from_region(bounds or config.bounds or region, resolution or config.resolution, config.crs)
+    cell = config.resolution if resolution is None else resolution
+    west, east, south, north = bounds or config.bounds or region
+    if not cell > 0.0:
+        msg = f"The resolution must be above zero, not {cell:g} m."
+        raise ConfigError(msg)
+    if not (west < east and south < north):
+        msg = f"Bounds are west east south north with west < east and south < north, not {west} {east} {south} {north}."
+        raise ConfigError(msg)
+    n_cells = (east - west) * (north - south) / cell**2
+    if n_cells > _MAX_CELLS:
+        msg = (
+            f"A raster of {east - west:,.0f} m x {north - south:,.0f} m at {cell:g} m has {n_cells:,.0f} cells; at most "
+            f"{_MAX_CELLS:,.0f} are made. Set bounds in programme.toml (stray points far from the site?) or a coarser "
+            "resolution."
+        )
+        raise ConfigError(msg)
+    return Grid.from_region((west, east, south, north), cell, config.crs)
 
 
 def predict_layers(model: SurfaceModel, grid: Grid) -> dict[str, FloatArray]:

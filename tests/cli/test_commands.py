@@ -206,6 +206,20 @@ def test_surface_writes_one_layer_or_all(tmp_path, site, capsys):
     assert "ends neither in .tif" in error["message"]
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--resolution", -1), "must be above zero"),
+        (("--resolution", 0), "must be above zero"),
+        (("--bounds", 5, 4, 3, 2), "west < east and south < north"),
+        (("--bounds", 0, 2e7, 0, 2e6), "stray points far from the site"),
+    ],
+)
+def test_surface_refuses_a_grid_that_cannot_be_meant(tmp_path, site, capsys, options, message):
+    error = run(capsys, "surface", site, FIRST, "-o", tmp_path / "out.tif", "--dry-run", *options, expect=78)["error"]
+    assert message in error["message"]
+
+
 def test_diff_writes_the_same_maps_as_update(tmp_path, site, capsys):
     document = run(capsys, "diff", site, FIRST, SECOND, "-o", tmp_path / "maps")
     assert document["output"]["summary"]["epoch_later"] == SECOND
