@@ -76,8 +76,8 @@ def product_grid(
     n_cells = (east - west) * (north - south) / cell**2
     if n_cells > _MAX_CELLS:
         msg = (
-            f"A raster of {east - west:,.0f} m x {north - south:,.0f} m at {cell:g} m has {n_cells:,.0f} cells; at most "
-            f"{_MAX_CELLS:,.0f} are made. Set bounds in programme.toml (stray points far from the site?) or a coarser "
+            f"A raster of {east - west:,.0f} m x {north - south:,.0f} m at {cell:g} m has {n_cells:,.0f} cells; at "
+            f"most {_MAX_CELLS:,.0f} are made. Set bounds in programme.toml (stray points far from the site?) or a coarser "
             "resolution."
         )
         raise ConfigError(msg)
