@@ -75,10 +75,10 @@ def product_grid(
         raise ConfigError(msg)
     n_cells = (east - west) * (north - south) / cell**2
     if n_cells > _MAX_CELLS:
+        size = f"{east - west:,.0f} m x {north - south:,.0f} m at {cell:g} m"
         msg = (
-            f"A raster of {east - west:,.0f} m x {north - south:,.0f} m at {cell:g} m has {n_cells:,.0f} cells; at "
-            f"most {_MAX_CELLS:,.0f} are made. Set bounds in programme.toml (stray points far from the site?) or a coarser "
-            "resolution."
+            f"A raster of {size} has {n_cells:,.0f} cells; at most {_MAX_CELLS:,.0f} are made. Set bounds in "
+            "programme.toml (are there stray points far from the site?) or a coarser resolution."
         )
         raise ConfigError(msg)
     return Grid.from_region((west, east, south, north), cell, config.crs)
