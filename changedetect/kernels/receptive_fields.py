@@ -293,6 +293,7 @@ def blend_planes(
     first_row: int,
     first_column: int,
     reach: float,
+    disagreement: float,
     blended: FloatArray,
 ) -> None:
     """
@@ -307,6 +308,8 @@ def blend_planes(
         Lattice indices of planes[:, 0, 0].
     reach : float
         Radius of the blending kernel, lattice spacings.
+    disagreement : float
+        Share of the weighted variance between the fields' answers that adds to the variance: their smoothing bias.
     blended : array, shape (n, 8)
         Filled in place: value, slope east, slope north, variance, noise variance, support (0 to 1), mean time,
         defined (1 or 0). Slopes are the blended slopes of the fields; the derivative of the blend itself also holds
@@ -321,7 +324,7 @@ def blend_planes(
         x, y = easting[p], northing[p]
         i0 = int(math.floor(y / spacing)) - first_row
         j0 = int(math.floor(x / spacing)) - first_column
-        w_sum = f_sum = fx = fy = sd = noise = support = time = flat = 0.0
+        w_sum = f_sum = ff_sum = fx = fy = sd = noise = support = time = flat = 0.0
         for i in range(max(0, i0 - k), min(n_i, i0 + k + 1)):
             dy = y - (first_row + i + 0.5) * spacing
             for j in range(max(0, j0 - k), min(n_j, j0 + k + 1)):
@@ -336,6 +339,7 @@ def blend_planes(
                 f = planes[0, i, j] + planes[1, i, j] * dx + planes[2, i, j] * dy
                 w_sum += w
                 f_sum += w * f
+                ff_sum += w * f * f
                 fx += w * planes[1, i, j]
                 fy += w * planes[2, i, j]
                 sd += w * math.sqrt(planes[3, i, j])
@@ -353,7 +357,7 @@ def blend_planes(
         o[0] = f
         o[1] = fx / w_sum
         o[2] = fy / w_sum
-        o[3] = (sd / w_sum) ** 2
+        o[3] = (sd / w_sum) ** 2 + disagreement * max(ff_sum / w_sum - f * f, 0.0)
         o[4] = noise / w_sum
         o[5] = support / flat
         o[6] = time / w_sum

@@ -105,11 +105,15 @@ class Level:
     planes : array, shape (N_PLANE, n_rows, n_columns)
     reach : float
         Radius of the blending kernel, lattice spacings.
+    disagreement : float
+        Share of the variance between neighbouring fields that adds to the variance: 1 for a finished surface, whose
+        smoothing bias it shows; 0 for the levels it is made of, whose bias the next level takes away.
     """
 
     lattice: Lattice
     planes: FloatArray
     reach: float = _SURFACE_REACH
+    disagreement: float = 1.0
 
     def blend(self, easting: FloatArray, northing: FloatArray) -> FloatArray:
         """Evaluate at places of shape (n,): array (n, 8), see `blend_planes`."""
@@ -117,7 +121,7 @@ class Level:
         lattice = self.lattice
         blend_planes(
             np.ascontiguousarray(easting), np.ascontiguousarray(northing), self.planes, lattice.spacing,
-            lattice.first_row, lattice.first_column, self.reach, blended,
+            lattice.first_row, lattice.first_column, self.reach, self.disagreement, blended,
         )  # fmt: skip
         return blended
 
@@ -294,7 +298,7 @@ def build_level(cells: Cells, lattice: Lattice, shrinkage: float, coarser: Level
     planes = np.zeros((N_PLANE, *lattice.shape))
     prior = _prior_variance(fits, shrinkage)
     shrink_planes(fits, base, prior, _detail_variance(fits, base), lattice.kernel, N_MINIMUM, planes)
-    return Level(lattice, planes, _LEVEL_REACH)
+    return Level(lattice, planes, _LEVEL_REACH, 0.0)
 
 
 def refine(cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shrinkage: float) -> Level:

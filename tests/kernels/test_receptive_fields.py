@@ -72,7 +72,7 @@ def test_blended_planes_reproduce_a_plane_and_its_slope():
     blended = Level(lattice, planes).blend(easting, northing)
     np.testing.assert_allclose(blended[:, 0], 2.0 + 0.5 * easting - 0.25 * northing, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(blended[:, 1:3], np.tile([0.5, -0.25], (50, 1)), rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(blended[:, 3], 0.04, rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(blended[:, 3], 0.04, rtol=0.0, atol=1e-12)
 
 
 def test_blend_answers_only_within_reach_of_a_field():
@@ -90,6 +90,14 @@ def test_better_fields_weigh_more_in_the_blend():
     planes[4] = [[1.0, 3.0]]
     middle = Level(Lattice(1.0, 1.0, 0, 0, 1, 2), planes).blend(np.array([1.0]), np.array([0.5]))
     np.testing.assert_allclose(middle[0, 0], 0.75, rtol=1e-12, atol=0.0)
+
+
+def test_disagreement_of_neighbours_adds_to_the_variance():
+    planes = np.zeros((kernel.N_PLANE, 1, 2))
+    planes[0], planes[3], planes[4] = [[0.0, 1.0]], 0.04, 1.0
+    lattice, middle = Lattice(1.0, 1.0, 0, 0, 1, 2), (np.array([1.0]), np.array([0.5]))
+    np.testing.assert_allclose(Level(lattice, planes).blend(*middle)[0, 3], 0.04 + 0.25, rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(Level(lattice, planes, 1.5, 0.0).blend(*middle)[0, 3], 0.04, rtol=1e-12, atol=0.0)
 
 
 def test_pooled_noise_ignores_a_minority_of_rough_fields():
