@@ -19,6 +19,7 @@ from changedetect.models.base import Prediction
 from changedetect.models.cells import Cells, Evidence, merge_cells
 from changedetect.models.lwpr_state import read_state, write_state
 from changedetect.models.pyramid import SUPPORT_KERNELS, CellPyramid, Level, noise_variance, refine, scale_bank, support
+from changedetect.models.steered import steer
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -368,8 +369,10 @@ class LWPRSurface:
         wanted = self.settings.cell_size_m or (kernel if is_dense else 0.5 * kernel)
         return float(2.0 ** math.floor(math.log2(wanted) + 1e-9))
 
-    def _refine(self, cells: Cells) -> Level:
-        return refine(cells, self.kernels_, self.settings.lattice_spacing, self.settings.shrinkage)
+    def _refine(self, cells: Cells, kernel: float) -> Level:
+        """Surface of cells whose density supports a kernel."""
+        level = refine(cells, self.kernels_, self.settings.lattice_spacing, self.settings.shrinkage)
+        return steer(cells, level, kernel)
 
     def _moved_memory(self, own: Cells) -> Cells | None:
         """
@@ -382,7 +385,7 @@ class LWPRSurface:
         memory = self.memory_
         if memory is None or len(memory) == 0:
             return None
-        remembered = self._refine(memory)
+        remembered = self._refine(memory, self.memory_kernel_)
         remembered.planes[6] = _support_at(memory, remembered, self.memory_kernel_)[0]
         surface = remembered.blend(*own.places)
         known = surface[:, 5] >= 0.5
@@ -410,7 +413,7 @@ class LWPRSurface:
         own = self.own_cells()
         memory = self._moved_memory(own)
         cells = own if memory is None else merge_cells([memory, own])
-        level = self._refine(cells)
+        level = self._refine(cells, self.own_kernel_)
         supported, _, noise, nearby = _support_at(own, level, self.own_kernel_)
         own_support = Level(level.lattice, level.planes.copy())
         own_support.planes[6] = supported

@@ -20,12 +20,12 @@ from changedetect.kernels.receptive_fields import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from changedetect.models.cells import Cells
     from changedetect.typing import FloatArray, Region
 
-__all__ = ["CellPyramid", "Lattice", "Level", "build_level", "noise_variance", "refine", "scale_bank"]
+__all__ = ["CellPyramid", "Lattice", "Level", "build_level", "noise_variance", "refine", "scale_bank", "windows"]
 
 #: Radius of the blending kernel in lattice spacings. While levels add up, wide: weights w / Gamma then let the fields
 #: win that lie on one side of an edge. For the finished surface narrow: one field for one place.
@@ -153,25 +153,48 @@ def scale_bank(finest: float, coarsest: float, ratio: float) -> list[float]:
     return [finest * ratio**k for k in range(n, -1, -1)]
 
 
+def windows(cells: Cells, lattice: Lattice, radius: float) -> Iterator[tuple[tuple[slice, slice], FloatArray, int, int]]:
+    """
+    Blocks of a lattice with the cells around them; blocks bound the memory and change no result.
+
+    Parameters
+    ----------
+    cells : Cells
+    lattice : Lattice
+    radius : float, m
+        How far beyond its centre a field sees.
+
+    Yields
+    ------
+    part : (slice, slice)
+        Rows and columns of the fields of this block.
+    window : array, shape (n, m, N_MOMENTS)
+        Moments of the cells that these fields see.
+    row, column : int
+        Lattice indices of the window's first cell.
+    """
+    c = cells.cell_size
+    for i in range(0, lattice.n_rows, _BLOCK_FIELDS):
+        for j in range(0, lattice.n_columns, _BLOCK_FIELDS):
+            part = (slice(i, min(i + _BLOCK_FIELDS, lattice.n_rows)), slice(j, min(j + _BLOCK_FIELDS, lattice.n_columns)))
+            south = (lattice.first_row + part[0].start) * lattice.spacing - radius
+            west = (lattice.first_column + part[1].start) * lattice.spacing - radius
+            north = (lattice.first_row + part[0].stop) * lattice.spacing + radius
+            east = (lattice.first_column + part[1].stop) * lattice.spacing + radius
+            rows = (math.floor(south / c), math.floor(north / c) + 1)
+            columns = (math.floor(west / c), math.floor(east / c) + 1)
+            yield part, cells.window(c, rows, columns), rows[0], columns[0]
+
+
 def _walk_blocks(
     kernel_function: Callable[..., None], cells: Cells, lattice: Lattice, results: FloatArray
 ) -> FloatArray:
-    """Run a kernel over all fields of a lattice, block by block; blocks bound the memory and change no result."""
-    c = cells.cell_size
-    radius = 2.0 * lattice.kernel
-    for i in range(0, lattice.n_rows, _BLOCK_FIELDS):
-        for j in range(0, lattice.n_columns, _BLOCK_FIELDS):
-            block = results[i : i + _BLOCK_FIELDS, j : j + _BLOCK_FIELDS]
-            south = (lattice.first_row + i) * lattice.spacing - radius
-            west = (lattice.first_column + j) * lattice.spacing - radius
-            north = (lattice.first_row + i + block.shape[0]) * lattice.spacing + radius
-            east = (lattice.first_column + j + block.shape[1]) * lattice.spacing + radius
-            rows = (math.floor(south / c), math.floor(north / c) + 1)
-            columns = (math.floor(west / c), math.floor(east / c) + 1)
-            kernel_function(
-                cells.window(c, rows, columns), c, rows[0], columns[0], lattice.kernel, lattice.spacing,
-                lattice.first_row + i, lattice.first_column + j, block,
-            )  # fmt: skip
+    """Run a kernel over all fields of a lattice, block by block."""
+    for part, window, row, column in windows(cells, lattice, 2.0 * lattice.kernel):
+        kernel_function(
+            window, cells.cell_size, row, column, lattice.kernel, lattice.spacing,
+            lattice.first_row + part[0].start, lattice.first_column + part[1].start, results[part],
+        )  # fmt: skip
     return results
 
 
