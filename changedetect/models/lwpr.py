@@ -39,6 +39,9 @@ _N_STEPS = 9
 _CHANGE_SHRINKAGE = 2.0
 #: Spacing, in kernels, of the places where the noise is estimated: neighbours share little data.
 _NOISE_SPACING = 1.6
+#: Growth, when a kernel grows by half an octave, of what ground that bends inside it adds to the noise: 4 where the
+#: ground has a curvature, 2 where it is as rough as a random walk.
+_BEND_GROWTH = 3.0
 
 
 @dataclass(frozen=True)
@@ -331,9 +334,14 @@ class LWPRSurface:
         from place to place: where quiet and noisy ground meet, weighted planes would follow the quiet side only.
         """
         cells = self.evidence_.cells(self.survey_time_)
+        sizes = CellPyramid(cells)
         kernel = self.own_kernel_
-        noise = noise_variance(CellPyramid(cells).for_kernel(kernel), kernel, _NOISE_SPACING * kernel)
-        factor = noise.blend(*cells.centres)[:, 0]
+        noise = [
+            noise_variance(sizes.for_kernel(size), size, _NOISE_SPACING * size).blend(*cells.centres)[:, 0]
+            for size in (kernel, math.sqrt(2.0) * kernel)
+        ]
+        bend = np.maximum(noise[1] - noise[0], 0.0) / (_BEND_GROWTH - 1.0)
+        factor = np.maximum(noise[0] - bend, 0.25 * noise[0])
         observed = factor * cells.moments[:, 0] / cells.moments[:, 1]
         return cells.with_noise(observed).with_weights_scaled(1.0 / float(np.median(factor)))
 
@@ -371,8 +379,10 @@ class LWPRSurface:
 
     def _refine(self, cells: Cells, kernel: float) -> Level:
         """Surface of cells whose density supports a kernel."""
-        level = refine(cells, self.kernels_, self.settings.lattice_spacing, self.settings.shrinkage)
-        return steer(cells, level, kernel)
+        level, unresolved = refine(cells, self.kernels_, self.settings.lattice_spacing, self.settings.shrinkage)
+        level = steer(cells, level, kernel)
+        level.planes[3] += unresolved
+        return level
 
     def _moved_memory(self, own: Cells) -> Cells | None:
         """
@@ -393,7 +403,7 @@ class LWPRSurface:
             return memory
         both = Cells(own.cell_size, own.row[known], own.column[known], own.moments[known])
         left_over = both.with_surface_removed(surface[known])
-        change = refine(left_over, self.kernels_, self.settings.lattice_spacing, _CHANGE_SHRINKAGE)
+        change, _ = refine(left_over, self.kernels_, self.settings.lattice_spacing, _CHANGE_SHRINKAGE)
         change.planes[6] = _support_at(left_over, change, self.own_kernel_)[0]
         moved = change.blend(*memory.places)
         moved[moved[:, 5] < 0.5, :3] = 0.0

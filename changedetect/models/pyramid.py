@@ -46,6 +46,8 @@ _DETAIL_REACH = 6.0
 _PRIOR_REACH = 2.0
 #: A squared coefficient counts at most this many noise variances, so that an edge does not sway the ground beside it.
 _RATIO_LIMIT = 100.0
+#: Detail of a level against that of the next coarser one, at most: 2**(-H) is 0.7 for ground as rough as a random walk.
+_LARGEST_DETAIL_RATIO = 0.8
 #: Receptive fields along one edge of a block of work; bounds memory and changes no result.
 _BLOCK_FIELDS = 512
 
@@ -153,7 +155,9 @@ def scale_bank(finest: float, coarsest: float, ratio: float) -> list[float]:
     return [finest * ratio**k for k in range(n, -1, -1)]
 
 
-def windows(cells: Cells, lattice: Lattice, radius: float) -> Iterator[tuple[tuple[slice, slice], FloatArray, int, int]]:
+def windows(
+    cells: Cells, lattice: Lattice, radius: float
+) -> Iterator[tuple[tuple[slice, slice], FloatArray, int, int]]:
     """
     Blocks of a lattice with the cells around them; blocks bound the memory and change no result.
 
@@ -176,7 +180,10 @@ def windows(cells: Cells, lattice: Lattice, radius: float) -> Iterator[tuple[tup
     c = cells.cell_size
     for i in range(0, lattice.n_rows, _BLOCK_FIELDS):
         for j in range(0, lattice.n_columns, _BLOCK_FIELDS):
-            part = (slice(i, min(i + _BLOCK_FIELDS, lattice.n_rows)), slice(j, min(j + _BLOCK_FIELDS, lattice.n_columns)))
+            part = (
+                slice(i, min(i + _BLOCK_FIELDS, lattice.n_rows)),
+                slice(j, min(j + _BLOCK_FIELDS, lattice.n_columns)),
+            )
             south = (lattice.first_row + part[0].start) * lattice.spacing - radius
             west = (lattice.first_column + part[1].start) * lattice.spacing - radius
             north = (lattice.first_row + part[0].stop) * lattice.spacing + radius
@@ -293,7 +300,7 @@ def _prior_variance(fits: FloatArray, shrinkage: float) -> FloatArray:
     return prior
 
 
-def build_level(cells: Cells, lattice: Lattice, shrinkage: float, coarser: Level | None) -> Level:
+def build_level(cells: Cells, lattice: Lattice, shrinkage: float, coarser: Level | None) -> tuple[Level, FloatArray]:
     """
     Receptive fields of one kernel size on what the coarser levels left over.
 
@@ -311,6 +318,8 @@ def build_level(cells: Cells, lattice: Lattice, shrinkage: float, coarser: Level
     -------
     level : Level
         Values are this level's share, the variance is that of the sum of all levels so far.
+    detail : array, shape (n_rows, n_columns), m2
+        Typical variance of that share around there.
     """
     base = np.zeros((2, *lattice.shape))
     if coarser is not None:
@@ -320,11 +329,36 @@ def build_level(cells: Cells, lattice: Lattice, shrinkage: float, coarser: Level
     fits = fit_lattice(cells, lattice)
     planes = np.zeros((N_PLANE, *lattice.shape))
     prior = _prior_variance(fits, shrinkage)
-    shrink_planes(fits, base, prior, _detail_variance(fits, base), lattice.kernel, N_MINIMUM, planes)
-    return Level(lattice, planes, _LEVEL_REACH, 0.0)
+    detail = _detail_variance(fits, base)
+    shrink_planes(fits, base, prior, detail, lattice.kernel, N_MINIMUM, planes)
+    return Level(lattice, planes, _LEVEL_REACH, 0.0), detail
 
 
-def refine(cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shrinkage: float) -> Level:
+def _unresolved_variance(levels: list[Level], details: list[FloatArray]) -> FloatArray:
+    """
+    Variance of what still finer levels would add, on the finest lattice; m2.
+
+    Detail shrinks from level to level; continued as a geometric series t r + t r**2 + ... with the ratio r of the last
+    two levels there, which on self-similar ground is exact.
+    """
+    finest = levels[-1].lattice
+    if len(levels) < 2:
+        return np.zeros(finest.shape)
+    last, coarser = details[-1], levels[-2].lattice
+    easting, northing = finest.centres()
+    row = np.clip(np.floor(northing / coarser.spacing).astype(np.int64) - coarser.first_row, 0, coarser.n_rows - 1)
+    column = np.clip(
+        np.floor(easting / coarser.spacing).astype(np.int64) - coarser.first_column, 0, coarser.n_columns - 1
+    )
+    before = details[-2][row, column].reshape(finest.shape)
+    ratio = np.minimum(last / np.maximum(before, 1e-12), _LARGEST_DETAIL_RATIO)
+    unresolved: FloatArray = last * ratio / (1.0 - ratio)
+    return unresolved
+
+
+def refine(
+    cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shrinkage: float
+) -> tuple[Level, FloatArray]:
     """
     A pyramid of receptive fields, summed into the fields of its finest level.
 
@@ -343,6 +377,8 @@ def refine(cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shr
     level : Level
         Each field holds value, slope and variance of the sum of all levels at its centre, so that a prediction costs
         the same however many levels there are.
+    unresolved : array, shape (n_rows, n_columns), m2
+        Variance of detail too fine for these kernels; not part of the level's variance.
     """
     if len(cells) == 0:
         msg = "a pyramid needs at least one occupied cell"
@@ -351,6 +387,7 @@ def refine(cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shr
     cells, height = cells.centred()
     sizes = CellPyramid(cells)
     levels: list[Level] = []
+    details: list[FloatArray] = []
     left, n_removed = cells, 0
     for kernel in kernels:
         suited = sizes.for_kernel(kernel)
@@ -360,7 +397,9 @@ def refine(cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shr
             left = left.with_surface_removed(level.blend(*left.places))
         n_removed = len(levels)
         lattice = Lattice.covering(region, kernel, lattice_spacing * kernel)
-        levels.append(build_level(left, lattice, shrinkage, levels[-1] if levels else None))
+        level, detail = build_level(left, lattice, shrinkage, levels[-1] if levels else None)
+        levels.append(level)
+        details.append(detail)
     finest = levels[-1]
     places = finest.lattice.centres()
     total = np.zeros((places[0].size, 3))
@@ -370,7 +409,7 @@ def refine(cells: Cells, kernels: tuple[float, ...], lattice_spacing: float, shr
     planes[:3] = total.T.reshape(3, *finest.lattice.shape)
     planes[0] += height
     planes[4] = planes[4] > 0.0
-    return Level(finest.lattice, planes)
+    return Level(finest.lattice, planes), _unresolved_variance(levels, details)
 
 
 def support(cells: Cells, lattice: Lattice, kernel: float) -> FloatArray:
