@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = [
     "N_FIT",
     "N_PLANE",
+    "add_surface",
     "blend_planes",
     "fit_planes",
     "pool_noise",
@@ -106,8 +107,9 @@ def fit_planes(
                     if n <= 0.0:
                         continue
                     u = (column0 + b + 0.5) * cell_size - x0
-                    du = u + m[2] / n
-                    dv = v + m[3] / n
+                    per_n = 1.0 / n
+                    du = u + m[2] * per_n
+                    dv = v + m[3] * per_n
                     q = (du * du + dv * dv) * per_h2
                     if q >= 4.0:
                         continue
@@ -365,53 +367,121 @@ def blend_planes(
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def pool_noise(fits: FloatArray, reach: int, n_minimum: float, fallback: float, pooled: FloatArray) -> None:
+def add_surface(
+    easting: FloatArray,
+    northing: FloatArray,
+    fields: FloatArray,
+    spacing: float,
+    first_row: int,
+    first_column: int,
+    reach: float,
+    surface: FloatArray,
+) -> None:
     """
-    Variance factor of the observations around each receptive field, insensitive to what its plane cannot follow.
+    Add the surface and its slope at scattered places: what `blend_planes` gives, and nothing else.
+
+    Parameters
+    ----------
+    easting, northing : array, shape (n,), m
+    fields : array, shape (n_i, n_j, 4)
+        Blending weight, value, slope east, slope north: the four that are needed, side by side in memory.
+    spacing : float, m
+    first_row, first_column : int
+        Lattice indices of fields[0, 0].
+    reach : float
+        Radius of the blending kernel, lattice spacings.
+    surface : array, shape (n, 3)
+        Value, slope east and slope north are added in place; nothing where no field answers.
+    """
+    radius = reach * spacing
+    r2 = radius * radius
+    per_r2 = 1.0 / r2
+    n_i, n_j = fields.shape[0], fields.shape[1]
+    for p in prange(easting.size):
+        # from the centre of field (0, 0)
+        x = easting[p] - (first_column + 0.5) * spacing
+        y = northing[p] - (first_row + 0.5) * spacing
+        i_low = max(0, int(math.ceil((y - radius) / spacing)))
+        i_high = min(n_i - 1, int(math.floor((y + radius) / spacing)))
+        w_sum = f_sum = fx = fy = 0.0
+        for i in range(i_low, i_high + 1):
+            dy = y - i * spacing
+            half = math.sqrt(max(r2 - dy * dy, 0.0))
+            j_low = max(0, int(math.ceil((x - half) / spacing)))
+            j_high = min(n_j - 1, int(math.floor((x + half) / spacing)))
+            for j in range(j_low, j_high + 1):
+                o = fields[i, j]
+                dx = x - j * spacing
+                w = 1.0 - (dx * dx + dy * dy) * per_r2
+                w *= w * o[0]
+                w_sum += w
+                f_sum += w * (o[1] + o[2] * dx + o[3] * dy)
+                fx += w * o[2]
+                fy += w * o[3]
+        if w_sum > 0.0:
+            surface[p, 0] += f_sum / w_sum
+            surface[p, 1] += fx / w_sum
+            surface[p, 2] += fy / w_sum
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def pool_noise(
+    fits: FloatArray, row: int, column: int, reach: int, n_minimum: float, fallback: float, pooled: FloatArray
+) -> None:
+    """
+    Variance factor of the observations, insensitive to what the planes cannot follow.
 
     Parameters
     ----------
     fits : array, shape (n_i, n_j, N_FIT)
+    row, column : int
+        Place k of the answer lies midway between fields row + 2 k and row + 2 k + 1; columns likewise.
     reach : int
-        Fields up to this many lattice steps away take part.
+        So many fields on every side take part.
     n_minimum : float
         Effective number of observations a field needs to take part.
     fallback : float
         Answer where fewer than three fields take part.
-    pooled : array, shape (n_i, n_j)
+    pooled : array, shape (m_i, m_j)
         Filled in place: the median of residual sum / degrees of freedom, weighted by degrees of freedom and divided
         by the median of chi-square with nu degrees over nu, (1 - 2 / (9 nu))**3 (Wilson and Hilferty 1931). Edges and
         other ground that bends inside a kernel raise the mean of these ratios, but not their median while they are
         the minority.
     """
     n_i, n_j = fits.shape[0], fits.shape[1]
-    side = 2 * reach + 1
-    for i in prange(n_i):
+    side = 2 * reach
+    for i in prange(pooled.shape[0]):
         ratio = np.empty(side * side)
         weight = np.empty(side * side)
-        for j in range(n_j):
+        for j in range(pooled.shape[1]):
             n = 0
             freedom = 0.0
-            for a in range(max(0, i - reach), min(n_i, i + reach + 1)):
-                for b in range(max(0, j - reach), min(n_j, j + reach + 1)):
+            for a in range(max(0, row + 2 * i - reach + 1), min(n_i, row + 2 * i + reach + 1)):
+                for b in range(max(0, column + 2 * j - reach + 1), min(n_j, column + 2 * j + reach + 1)):
                     o = fits[a, b]
                     if o[9] > 0.0 and o[10] >= n_minimum and o[12] > 0.25 * o[9] / o[15]:
-                        ratio[n] = o[11] / o[12]
+                        # kept in ascending order: a few dozen values at most
+                        value = o[11] / o[12]
+                        k = n
+                        while k > 0 and ratio[k - 1] > value:
+                            ratio[k] = ratio[k - 1]
+                            weight[k] = weight[k - 1]
+                            k -= 1
+                        ratio[k] = value
                         # degrees of freedom of the quadratic form, not of the weights: n_eff less the plane's three
-                        weight[n] = max(o[10] - 3.0, 1.0)
-                        freedom += weight[n]
+                        weight[k] = max(o[10] - 3.0, 1.0)
+                        freedom += weight[k]
                         n += 1
             if n < 3:
                 pooled[i, j] = fallback
                 continue
-            order = np.argsort(ratio[:n])
             below = 0.0
             k = 0
-            while k < n - 1 and below + weight[order[k]] < 0.5 * freedom:
-                below += weight[order[k]]
+            while k < n - 1 and below + weight[k] < 0.5 * freedom:
+                below += weight[k]
                 k += 1
             nu = freedom / n
-            pooled[i, j] = ratio[order[k]] / (1.0 - 2.0 / (9.0 * nu)) ** 3
+            pooled[i, j] = ratio[k] / (1.0 - 2.0 / (9.0 * nu)) ** 3
 
 
 @njit(cache=True, parallel=True, error_model="numpy")

@@ -78,8 +78,6 @@ def fit_steered_planes(
     radius = 2.0 * along
     for i in prange(fits.shape[0]):
         y0 = (first_row + i + 0.5) * spacing
-        a_low = max(0, int(math.floor((y0 - radius) / cell_size)) - row0)
-        a_high = min(window.shape[0] - 1, int(math.floor((y0 + radius) / cell_size)) - row0)
         for j in range(fits.shape[1]):
             o = fits[i, j]
             for c in range(N_STEERED):
@@ -88,8 +86,14 @@ def fit_steered_planes(
                 continue
             ex, ey, bend = geometry[i, j, 0], geometry[i, j, 1], geometry[i, j, 2]
             x0 = (first_column + j + 0.5) * spacing
-            b_low = max(0, int(math.floor((x0 - radius) / cell_size)) - column0)
-            b_high = min(window.shape[1] - 1, int(math.floor((x0 + radius) / cell_size)) - column0)
+            # half the extent of the ellipse, and how far its ends bend away
+            bulge = 2.0 * abs(bend) * along * along
+            reach_x = 2.0 * math.hypot(along * ey, across * ex) + bulge * abs(ex)
+            reach_y = 2.0 * math.hypot(along * ex, across * ey) + bulge * abs(ey)
+            a_low = max(0, int(math.floor((y0 - reach_y) / cell_size)) - row0)
+            a_high = min(window.shape[0] - 1, int(math.floor((y0 + reach_y) / cell_size)) - row0)
+            b_low = max(0, int(math.floor((x0 - reach_x) / cell_size)) - column0)
+            b_high = min(window.shape[1] - 1, int(math.floor((x0 + reach_x) / cell_size)) - column0)
             s0 = s1 = s2 = s3 = s4 = s5 = 0.0
             t0 = t1 = t2 = t3 = t4 = t5 = 0.0
             z0 = z1 = z2 = zz = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ __all__ = ["TILE_CELLS", "Cells", "Evidence", "merge_cells"]
 
 #: Cells along one edge of a tile, the unit in which evidence is accumulated and stored.
 TILE_CELLS = 256
+#: Cells of a dense window for each cell deposited in it, at most.
+_DENSE_WINDOW = 2
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,10 @@ def _gather(cells: Cells, cell_size: float) -> Cells:
         return replace(cells, cell_size=cell_size)
     m = cells.moments
     easting, northing = cells.centres
+    if cell_size > cells.cell_size:
+        dense = _gather_dense(cells, cell_size)
+        if dense is not None:
+            return dense
     row = np.floor((northing + m[:, 3] / m[:, 1]) / cell_size).astype(np.int64)
     column = np.floor((easting + m[:, 2] / m[:, 1]) / cell_size).astype(np.int64)
     row0, column0 = int(row.min()), int(column.min())
@@ -146,6 +153,18 @@ def _gather(cells: Cells, cell_size: float) -> Cells:
     v = northing - (row + 0.5) * cell_size
     kernel.gather_moments(m, u, v, inverse.reshape(-1).astype(np.int64), gathered)
     return Cells(cell_size, new_row, new_column, gathered)
+
+
+def _gather_dense(cells: Cells, cell_size: float) -> Cells | None:
+    """Do the same over a dense window, which needs no sorting; None where most of the window would be empty."""
+    west, east, south, north = cells.region
+    rows = (math.floor(south / cell_size), math.ceil(north / cell_size) + 1)
+    columns = (math.floor(west / cell_size), math.ceil(east / cell_size) + 1)
+    if (rows[1] - rows[0]) * (columns[1] - columns[0]) > _DENSE_WINDOW * len(cells):
+        return None
+    window = cells.window(cell_size, rows, columns)
+    row, column = np.nonzero(window[..., 1])
+    return Cells(cell_size, row + rows[0], column + columns[0], window[row, column])
 
 
 def merge_cells(parts: list[Cells]) -> Cells:

@@ -101,7 +101,12 @@ def point_density(easting: FloatArray, northing: FloatArray) -> float:
         row = np.floor(northing / side).astype(np.int64)
         column = np.floor(easting / side).astype(np.int64)
         key = (row - row.min()) * (int(np.ptp(column)) + 1) + (column - column.min())
-        count = np.unique(key, return_counts=True)[1]
+        # counting needs no sorting, but a place for every square: clusters far apart would leave most empty
+        if key.max() < 8 * key.size:
+            count = np.bincount(key)
+            count = count[count > 0]
+        else:
+            count = np.unique(key, return_counts=True)[1]
         density = float(np.percentile(count, 75)) / side**2
         wanted = 2.0 ** round(math.log2(math.sqrt(12.0 / density)))
         if wanted >= side:
@@ -457,4 +462,5 @@ class LWPRSurface:
 
 def _support_at(cells: Cells, level: Level, finest: float) -> FloatArray:
     kernel = SUPPORT_KERNELS * finest
-    return support(CellPyramid(cells).for_kernel(kernel), level.lattice, kernel)
+    # whole cells count where their observations are on average: cells of a kernel's size will do
+    return support(CellPyramid(cells).for_kernel(2.0 * kernel), level.lattice, kernel)

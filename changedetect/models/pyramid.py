@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, uniform_filter
 
 from changedetect.kernels.receptive_fields import (
     N_FIT,
     N_PLANE,
+    add_surface,
     blend_planes,
     fit_planes,
     pool_noise,
@@ -37,10 +38,10 @@ N_MINIMUM = 4.0
 CENTROID_LIMIT = 0.75
 #: Kernel, in the finest kernels an epoch's density supports, within which observations must surround a place.
 SUPPORT_KERNELS = 2.0
-#: Lattice steps over which the noise variance is pooled.
+#: Lattice steps on every side over which the noise variance is pooled.
 NOISE_REACH = 3
-#: Lattice steps over which the typical detail of a level is averaged.
-_DETAIL_REACH = 6.0
+#: Lattice steps along the edge of the window, applied twice, over which the typical detail of a level is averaged.
+_DETAIL_WINDOW = 15
 #: Lattice steps over which the prior variance of detail is pooled: of 0.7, 1.2 and 2.0 the last had the least error on
 #: dense and on sparse data.
 _PRIOR_REACH = 2.0
@@ -48,6 +49,8 @@ _PRIOR_REACH = 2.0
 _RATIO_LIMIT = 100.0
 #: Detail of a level against that of the next coarser one, at most: 2**(-H) is 0.7 for ground as rough as a random walk.
 _LARGEST_DETAIL_RATIO = 0.8
+#: Largest cells, in kernels, from which a field is computed: the plane inside a cell is exact, its activation is not.
+_CELL_LIMIT = 0.55
 #: Receptive fields along one edge of a block of work; bounds memory and changes no result.
 _BLOCK_FIELDS = 512
 
@@ -128,6 +131,18 @@ class Level:
         return blended
 
 
+    def add_to(self, easting: FloatArray, northing: FloatArray, surface: FloatArray) -> None:
+        """Add value and slopes at places of shape (n,) to an array (n, 3); nothing where no field answers."""
+        lattice = self.lattice
+        # undefined planes may hold anything; their weight is 0
+        fields = np.where(self.planes[4] > 0.0, self.planes[[4, 0, 1, 2]], 0.0)
+        add_surface(
+            np.ascontiguousarray(easting), np.ascontiguousarray(northing),
+            np.ascontiguousarray(np.moveaxis(fields, 0, -1)), lattice.spacing, lattice.first_row,
+            lattice.first_column, self.reach, surface,
+        )  # fmt: skip
+
+
 class CellPyramid:
     """
     The same moments over cells of doubling size, made when first asked for.
@@ -142,8 +157,8 @@ class CellPyramid:
         self._sizes = [cells]
 
     def for_kernel(self, kernel: float) -> Cells:
-        """Coarsest cells of at most 0.55 kernels, or the finest there are."""
-        k = max(0, math.floor(math.log2(0.55 * kernel / self._sizes[0].cell_size)))
+        """Coarsest cells of at most `_CELL_LIMIT` kernels, or the finest there are."""
+        k = max(0, math.floor(math.log2(_CELL_LIMIT * kernel / self._sizes[0].cell_size)))
         while len(self._sizes) <= k:
             self._sizes.append(self._sizes[-1].coarsened())
         return self._sizes[k]
@@ -250,12 +265,15 @@ def noise_variance(cells: Cells, kernel: float, spacing: float) -> Level:
         lattice = Lattice.covering(cells.region, wider, spacing)
         usable = (fits[..., 10] >= N_MINIMUM + 1.0) & (fits[..., 12] > 0.0)
     typical = float(np.median(fits[usable][:, 11] / fits[usable][:, 12])) if usable.any() else 1.0
-    pooled = np.empty(lattice.shape)
-    pool_noise(fits, NOISE_REACH, N_MINIMUM + 1.0, typical, pooled)
-    planes = np.zeros((N_PLANE, *lattice.shape))
+    # neighbouring windows share most of their fields: every other one will do
+    wide = Lattice.covering(cells.region, lattice.kernel, 2.0 * lattice.spacing)
+    row, column = 2 * wide.first_row - lattice.first_row, 2 * wide.first_column - lattice.first_column
+    pooled = np.empty(wide.shape)
+    pool_noise(fits, row, column, NOISE_REACH, N_MINIMUM + 1.0, typical, pooled)
+    planes = np.zeros((N_PLANE, *wide.shape))
     planes[0] = np.maximum(pooled, 1e-4 * typical + 1e-12)
     planes[4] = 1.0
-    return Level(lattice, planes)
+    return Level(wide, planes)
 
 
 def _detail_variance(fits: FloatArray, base: FloatArray) -> FloatArray:
@@ -266,9 +284,14 @@ def _detail_variance(fits: FloatArray, base: FloatArray) -> FloatArray:
     excess = np.where(usable, fits[..., 0] ** 2 - np.maximum(fits[..., 3] - base[0], 0.0), 0.0)
     weight = usable.astype(np.float64)
     overall = excess.sum() / weight.sum()
-    smooth = gaussian_filter(excess, _DETAIL_REACH, truncate=3.0, mode="constant")
-    mass = gaussian_filter(weight, _DETAIL_REACH, truncate=3.0, mode="constant")
-    local: FloatArray = np.maximum((smooth + 1e-3 * overall) / (mass + 1e-3), 0.0)
+
+    def smooth(values: FloatArray) -> FloatArray:
+        # a triangle in each direction: as good as a Gaussian and its cost does not grow with the window
+        for _ in range(2):
+            values = uniform_filter(values, _DETAIL_WINDOW, mode="constant")
+        return values
+
+    local: FloatArray = np.maximum((smooth(excess) + 1e-3 * overall) / (np.maximum(smooth(weight), 0.0) + 1e-3), 0.0)
     return local
 
 
@@ -388,14 +411,16 @@ def refine(
     sizes = CellPyramid(cells)
     levels: list[Level] = []
     details: list[FloatArray] = []
-    left, n_removed = cells, 0
+    suited = cells
+    places, removed, n_removed = cells.places, np.zeros((len(cells), 3)), 0
     for kernel in kernels:
-        suited = sizes.for_kernel(kernel)
-        if suited.cell_size != left.cell_size or not levels:
-            left, n_removed = suited, 0
+        if sizes.for_kernel(kernel) is not suited:
+            suited = sizes.for_kernel(kernel)
+            places, removed, n_removed = suited.places, np.zeros((len(suited), 3)), 0
         for level in levels[n_removed:]:
-            left = left.with_surface_removed(level.blend(*left.places))
+            level.add_to(*places, removed)
         n_removed = len(levels)
+        left = suited.with_surface_removed(removed)
         lattice = Lattice.covering(region, kernel, lattice_spacing * kernel)
         level, detail = build_level(left, lattice, shrinkage, levels[-1] if levels else None)
         levels.append(level)
@@ -404,7 +429,7 @@ def refine(
     places = finest.lattice.centres()
     total = np.zeros((places[0].size, 3))
     for level in levels:
-        total += level.blend(*places)[:, :3]
+        level.add_to(*places, total)
     planes = finest.planes.copy()
     planes[:3] = total.T.reshape(3, *finest.lattice.shape)
     planes[0] += height

@@ -34,6 +34,9 @@ _DIRECTION_WINDOW = 1.13
 _CURVATURE_WINDOW = 2.0
 #: Largest curvature of a level line, times the kernel along it: the parabola of the field stands for an arc.
 _CURVATURE_LIMIT = 0.5
+#: Roughness, in variances of the surface, from which a field may be steered. The blur of a round field is about a
+#: quarter of the roughness (both as standard deviations), so below this it is a third of the noise.
+_ROUGHNESS = 2.0
 #: Standard deviation, in lattice steps, of the window over which fields are compared.
 _COMPARE_REACH = 1.5
 #: A squared difference counts at most this many noise variances in the comparison with noise.
@@ -101,12 +104,12 @@ def level_lines(level: Level, kernel: float) -> FloatArray:
     geometry = np.empty((*level.lattice.shape, N_GEOMETRY))
     geometry[..., 0], geometry[..., 1] = ex, ey
     geometry[..., 2] = np.clip(curvature, -limit, limit)
-    geometry[..., 3] = (level.planes[4] > 0.0) & (roughness > level.planes[3])
+    geometry[..., 3] = (level.planes[4] > 0.0) & (roughness > _ROUGHNESS * level.planes[3])
     return geometry
 
 
 def _fit(cells: Cells, lattice: Lattice, geometry: FloatArray, kernel: float, elongation: float) -> FloatArray:
-    """Steered planes of a lattice, of the area of a round field of this kernel; shape (n_rows, n_columns, N_STEERED)."""
+    """Planes of the steered fields of a lattice, each of the area of a round field of this kernel."""
     along, across = kernel * math.sqrt(elongation), kernel / math.sqrt(elongation)
     fits = np.zeros((*lattice.shape, N_STEERED))
     for part, window, row, column in windows(cells, lattice, 2.0 * along):
