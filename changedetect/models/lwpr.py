@@ -18,6 +18,7 @@ from changedetect.config import AdaptiveConfig
 from changedetect.models.base import Prediction
 from changedetect.models.cells import Cells, Evidence, merge_cells
 from changedetect.models.lwpr_state import read_state, write_state
+from changedetect.models.outliers import gross_errors
 from changedetect.models.pyramid import SUPPORT_KERNELS, CellPyramid, Level, noise_variance, refine, scale_bank, support
 from changedetect.models.steered import steer
 
@@ -30,6 +31,8 @@ __all__ = ["LWPRSurface", "check_observations", "point_density"]
 
 #: Finest kernel in mean point spacings: about nine observations, effectively, in a receptive field.
 _FINEST_KERNEL = 1.16
+#: Kernel, in the finest the density supports, from which an epoch counts as dense.
+_DENSE = 2.0
 #: The pyramid goes half an octave below the kernel that the density supports on average: where there is detail the
 #: shrinkage keeps it.
 _FINEST_LEVEL = 2.0**-0.5
@@ -183,6 +186,31 @@ class LWPRSurface:
         for name in [key for key in self.__dict__ if key.endswith("_") or key == "_built"]:
             del self.__dict__[name]
         return self.partial_fit(coordinates, elevation, sigma, survey_time)
+
+    def without_gross_errors(self, coordinates: Coordinates, elevation: FloatArray) -> BoolArray:
+        """
+        Which observations of a whole epoch others support.
+
+        Parameters
+        ----------
+        coordinates : (easting, northing), each shape (n,), m
+        elevation : array, shape (n,), m
+
+        Returns
+        -------
+        kept : array, shape (n,), bool
+
+        Notes
+        -----
+        To be asked before `partial_fit`, which may get an epoch in parts and leaves nothing out: what stands alone in a
+        part need not do so in the whole.
+        """
+        easting, northing, z, _ = check_observations(coordinates, elevation, None)
+        if self.settings.outlier_limit == 0.0 or z.size == 0:
+            return np.ones(z.size, np.bool_)
+        density = point_density(easting, northing)
+        is_dense = self._finest_kernel(1.0 / math.sqrt(density)) >= _DENSE * _FINEST_KERNEL / math.sqrt(density)
+        return ~gross_errors((easting, northing), z, density, self.settings.outlier_limit, is_dense=is_dense)
 
     def partial_fit(
         self,
@@ -378,7 +406,7 @@ class LWPRSurface:
         holds six observations or more and the plane inside it is known.
         """
         kernel = self.own_kernel_
-        is_dense = kernel >= 2.0 * _FINEST_KERNEL * spacing
+        is_dense = kernel >= _DENSE * _FINEST_KERNEL * spacing
         wanted = self.settings.cell_size_m or (kernel if is_dense else 0.5 * kernel)
         return float(2.0 ** math.floor(math.log2(wanted) + 1e-9))
 

@@ -130,7 +130,6 @@ class Level:
         )  # fmt: skip
         return blended
 
-
     def add_to(self, easting: FloatArray, northing: FloatArray, surface: FloatArray) -> None:
         """Add value and slopes at places of shape (n,) to an array (n, 3); nothing where no field answers."""
         lattice = self.lattice
