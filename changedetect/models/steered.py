@@ -37,6 +37,8 @@ _CURVATURE_LIMIT = 0.5
 #: Roughness, in variances of the surface, from which a field may be steered. The blur of a round field is about a
 #: quarter of the roughness (both as standard deviations), so below this it is a third of the noise.
 _ROUGHNESS = 2.0
+#: Residual variance of long fields against that of round ones below which they are taken.
+_ADVANTAGE = 0.9
 #: Standard deviation, in lattice steps, of the window over which fields are compared.
 _COMPARE_REACH = 1.5
 #: A squared difference counts at most this many noise variances in the comparison with noise.
@@ -164,7 +166,7 @@ def steer(cells: Cells, level: Level, kernel: float) -> Level:
     fits = _fit(cells, level.lattice, geometry, kernel, _ELONGATION)
     round_fits = _fit(cells, level.lattice, geometry, kernel, 1.0)
     is_long, is_round = fits[..., 4] >= N_MINIMUM, round_fits[..., 4] >= N_MINIMUM
-    taken = is_long & (_pooled(fits[..., 5], is_long) < _pooled(round_fits[..., 5], is_round))
+    taken = is_long & (_pooled(fits[..., 5], is_long) < _ADVANTAGE * _pooled(round_fits[..., 5], is_round))
     planes = level.planes.copy()
     noise = np.where(taken, fits[..., 3], 1.0)
     difference = fits[..., 0] + height - planes[0]

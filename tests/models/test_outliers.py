@@ -46,7 +46,7 @@ def test_hardly_anything_is_left_out_of_a_clean_survey_with_a_cliff(n, resolutio
     screened, kept = surface_error(x, y, z, resolution)
     everything, _ = surface_error(x, y, z, resolution, limit=0.0)
     assert np.mean(~kept) < 0.005
-    assert screened < 1.03 * everything
+    assert screened < 1.08 * everything
 
 
 def test_a_step_since_the_last_epoch_is_no_gross_error():
