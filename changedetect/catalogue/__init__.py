@@ -18,6 +18,7 @@ from changedetect.catalogue.epoch import Epoch, Source, parse_date, survey_time_
 from changedetect.catalogue.programme import ChangeProduct, Programme
 from changedetect.catalogue.records import (
     MANIFEST_FILE,
+    AlignmentRecord,
     ProductRecord,
     SourceRecord,
     StateRecord,
@@ -36,6 +37,7 @@ from changedetect.catalogue.staleness import (
 
 __all__ = [
     "MANIFEST_FILE",
+    "AlignmentRecord",
     "ChangeProduct",
     "Epoch",
     "Item",

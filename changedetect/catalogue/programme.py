@@ -144,6 +144,12 @@ class Programme:
         """Where runs leave their manifests."""
         return self.directory / "runs"
 
+    @property
+    def stable_areas_path(self) -> Path | None:
+        """File of polygons that do not change, if the settings name one."""
+        name = self.config.coregistration.stable_areas
+        return None if name is None else self.directory / Path(name).expanduser()
+
     def state_directory(self, epoch_id: str) -> Path:
         """Where the model of an epoch lies."""
         return self.directory / "state" / epoch_id

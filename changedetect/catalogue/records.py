@@ -7,15 +7,28 @@ again makes everything derived from it stale.
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 from changedetect.errors import ModelStateError
 from changedetect.storage import read_json, sha256_of_file, write_json
 
-__all__ = ["MANIFEST_FILE", "ProductRecord", "SourceRecord", "StateRecord", "damaged_files", "describe_files"]
+if TYPE_CHECKING:
+    from changedetect.coregistration import Alignment
+
+__all__ = [
+    "MANIFEST_FILE",
+    "AlignmentRecord",
+    "ProductRecord",
+    "SourceRecord",
+    "StateRecord",
+    "damaged_files",
+    "describe_files",
+]
 
 MANIFEST_FILE = "manifest.json"
 
@@ -50,6 +63,56 @@ class SourceRecord:
     n_read: int
     n_used: int
     crs: str | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignmentRecord:
+    """
+    How an epoch was aligned to the reference surface, the model of the first epoch.
+
+    Attributes
+    ----------
+    reference : str
+        Epoch id.
+    reference_sha256 : str
+        `StateRecord.evidence_sha256` of that epoch.
+    stable_areas_sha256 : str or None
+        Checksum of the file of stable areas; None where unchanged ground was found.
+    is_applied : bool
+        Whether the epoch's points were moved.
+    wording : str
+        What was found and done, for people.
+    warnings : tuple of str
+    estimate : mapping or None
+        `Alignment.to_dict`: transform, covariance, residuals, the choice; None where nothing could be estimated, or
+        nothing had to be.
+    """
+
+    reference: str
+    reference_sha256: str
+    stable_areas_sha256: str | None
+    is_applied: bool
+    wording: str
+    warnings: tuple[str, ...]
+    estimate: Mapping[str, Any] | None
+
+    @property
+    def kind(self) -> str:
+        """The kind of transform that was applied, or "none"."""
+        return str(self.estimate["transform"]["kind"]) if self.is_applied and self.estimate else "none"
+
+    def applied(self) -> Alignment | None:
+        """
+        Return the alignment that moved the epoch; None where it was not moved.
+
+        Raises
+        ------
+        ValueError, KeyError
+            The record was written by another version.
+        """
+        from changedetect.coregistration import Alignment  # compiled code, which listing epochs has no use for
+
+        return Alignment.from_dict(dict(self.estimate)) if self.is_applied and self.estimate else None
 
 
 class _Manifest:
@@ -110,6 +173,8 @@ class StateRecord(_Manifest):
     learning_sha256, config_sha256 : str
         Fingerprints of the settings.
     sources : tuple of SourceRecord
+    alignment : AlignmentRecord or None
+        None for the reference itself, and where co-registration is switched off.
     n_points : int
         Observations learned in this epoch.
     region : tuple (west, east, south, north), m
@@ -118,7 +183,7 @@ class StateRecord(_Manifest):
     software_version, created : str
     """
 
-    FORMAT: ClassVar[int] = 1
+    FORMAT: ClassVar[int] = 2
 
     epoch_id: str
     mode: str
@@ -129,6 +194,7 @@ class StateRecord(_Manifest):
     learning_sha256: str
     config_sha256: str
     sources: tuple[SourceRecord, ...]
+    alignment: AlignmentRecord | None
     n_points: int
     region: tuple[float, float, float, float]
     files: Mapping[str, Mapping[str, Any]]
@@ -140,7 +206,21 @@ class StateRecord(_Manifest):
         """Build from the JSON object of `path`."""
         sources = tuple(_from_document(SourceRecord, item, path) for item in document.get("sources", []))
         region = tuple(document.get("region", ()))
-        return _from_document(cls, {**document, "sources": sources, "region": region}, path)
+        alignment = document.get("alignment")
+        if alignment is not None:
+            listed = {**alignment, "warnings": tuple(alignment.get("warnings", ()))}
+            alignment = _from_document(AlignmentRecord, listed, path)
+        given: dict[str, Any] = {"sources": sources, "region": region}
+        if "alignment" in document:
+            given["alignment"] = alignment
+        return _from_document(cls, {**document, **given}, path)
+
+    @property
+    def evidence_sha256(self) -> str:
+        """Fingerprint of what the epoch's own evidence follows from: its sources, how they are read, the settings."""
+        parts = [self.epoch_id, self.survey_time, self.learning_sha256, self.n_points]
+        parts += [[source.sha256, dict(source.options)] for source in self.sources]
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from changedetect.catalogue.epoch import Epoch, Source
 from changedetect.catalogue.programme import ChangeProduct, Programme
-from changedetect.catalogue.records import SourceRecord, damaged_files
+from changedetect.catalogue.records import AlignmentRecord, SourceRecord, damaged_files
 from changedetect.errors import MissingInputError, ModelStateError
 from changedetect.storage import sha256_of_file
 
@@ -103,9 +103,9 @@ def state_reasons(
     parent : Epoch or None
         The epoch whose model it adapts.
     states : mapping of epoch id to the SHA-256 of its state's manifest
-        Of the earlier epochs.
+        Of the earlier epochs, in order; later ones are aligned to the first.
     """
-    own = own_state_reasons(programme, epoch)
+    own = own_state_reasons(programme, epoch, _reference(states))
     found = programme.state_record(epoch.epoch_id) if own == () else None
     if found is None:
         return own
@@ -117,8 +117,17 @@ def state_reasons(
     return ()
 
 
-def own_state_reasons(programme: Programme, epoch: Epoch) -> tuple[str, ...]:
-    """Say why the model of an epoch has to be learned from its sources, whatever its parent."""
+def own_state_reasons(programme: Programme, epoch: Epoch, reference_id: str | None) -> tuple[str, ...]:
+    """
+    Say why the model of an epoch has to be learned from its sources, whatever its parent.
+
+    Parameters
+    ----------
+    programme : Programme
+    epoch : Epoch
+    reference_id : str or None
+        Epoch it is aligned to; None where it is the first.
+    """
     try:
         found = programme.state_record(epoch.epoch_id)
     except ModelStateError as error:
@@ -131,6 +140,7 @@ def own_state_reasons(programme: Programme, epoch: Epoch) -> tuple[str, ...]:
     reasons += _changed_sources(programme, epoch.sources, record.sources)
     if record.survey_time != epoch.survey_time:
         reasons.append("its date has changed")
+    reasons += _changed_alignment(programme, reference_id, record.alignment)
     return tuple(reasons)
 
 
@@ -166,6 +176,27 @@ def _product_reasons(
         if record.states.get(epoch_id) != states[epoch_id]:
             reasons.append(f"the model of {epoch_id} {_learned(states[epoch_id])}")
     return tuple(reasons)
+
+
+def _reference(states: Mapping[str, str]) -> str | None:
+    """Epoch that later ones are aligned to: the first in order of time."""
+    return next(iter(states), None)
+
+
+def _changed_alignment(programme: Programme, reference_id: str | None, record: AlignmentRecord | None) -> list[str]:
+    """Compare what an epoch was aligned to with what it is to be aligned to now."""
+    wanted = reference_id if programme.config.coregistration.enabled else None
+    if record is None or wanted is None:
+        return [] if record is None and wanted is None else [f"it is to be aligned to {_name(wanted)} now"]
+    if record.reference != wanted:
+        return [f"it is to be aligned to {_name(wanted)} now, and was aligned to {_name(record.reference)}"]
+    reference = programme.intact_state_record(wanted)
+    if reference is not None and reference.evidence_sha256 != record.reference_sha256:
+        return [f"epoch {wanted}, which it is aligned to, was learned from other data"]
+    areas = programme.stable_areas_path
+    if areas is not None and areas.is_file() and sha256_of_file(areas) != record.stable_areas_sha256:
+        return [f"the stable areas in {areas.name} have changed"]
+    return []
 
 
 def _name(epoch_id: str | None) -> str:

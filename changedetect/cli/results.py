@@ -1,4 +1,4 @@
-"""Commands that ask learned models: predict, surface, diff."""
+"""Commands that ask learned models: predict, surface, diff, volume."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from changedetect.cli.options import Bounds, Directory, DryRun, EpochId, Overwri
 from changedetect.cli.session import Outcome, Session, command
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from changedetect.catalogue import Programme
+    from changedetect.typing import JSONObject
 
 __all__ = ["register"]
 
@@ -35,6 +38,7 @@ def register(app: typer.Typer) -> None:
     command(app, "predict")(predict)
     command(app, "surface")(surface)
     command(app, "diff")(diff)
+    command(app, "volume")(volume)
 
 
 def predict(
@@ -140,6 +144,82 @@ def diff(
         logger.warning("%s", warning)
         text.append(f"Warning: {warning}")
     return Outcome(document, [*text])
+
+
+def volume(
+    session: Session,
+    *,
+    directory: Directory,
+    earlier: Annotated[str, typer.Argument(metavar="EARLIER", help="Epoch to compare with.", show_default=False)],
+    later: Annotated[str, typer.Argument(metavar="LATER", help="Epoch to compare.", show_default=False)],
+    zones: Annotated[
+        Path | None, typer.Option("--zones", metavar="FILE", help="Polygons that get a budget each, in any CRS.")
+    ] = None,
+    layer: Annotated[
+        str | None, typer.Option("--layer", help="Layer of the zones, where the file has several.")
+    ] = None,
+    name_column: Annotated[
+        str | None, typer.Option("--name-column", help="Column with the names of the zones.")
+    ] = None,
+    bands: Annotated[
+        float | None, typer.Option("--bands", metavar="HEIGHT", help="Budget per band of elevation of this height, m.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="OUT.csv", help="Table to write.", show_default=False)
+    ] = None,
+    overwrite: Overwrite = False,
+    dry_run: DryRun = False,
+) -> Outcome:
+    """
+    Measure raised, lowered and net volume between two epochs, each with its interval.
+
+    For example:
+
+    changedetect volume site 2024-05-01 2024-09-03
+
+    changedetect volume site 2024-05-01 2024-09-03 --zones cells.gpkg --bands 1.0 -o volumes.csv
+    """
+    from changedetect.pipeline.volumes import measure_volumes
+
+    if bands is not None and not bands > 0.0:
+        msg = f"the height of a band must be above zero, not {bands:g}"
+        raise typer.BadParameter(msg, param_hint="--bands")
+    programme = _asked(_asked(session.open(directory), earlier), later)
+    details = measure_volumes(
+        programme,
+        earlier,
+        later,
+        zones=zones,
+        layer=layer,
+        name_column=name_column,
+        band_height=bands,
+        output=output,
+        overwrite=overwrite,
+        dry_run=dry_run,
+    )
+    document = {"directory": str(directory), "earlier": earlier, "later": later, "dry_run": dry_run, **details}
+    if dry_run:
+        return Outcome(document, [f"Would measure the volumes from {earlier} to {later}, {details['n_zones']} zones"])
+    for warning in details["warnings"]:
+        logger.warning("%s", warning)
+    return Outcome(document, [_volume_table(details), *(f"Warning: {text}" for text in details["warnings"])])
+
+
+def _volume_table(details: JSONObject) -> Table:
+    from rich.table import Table
+
+    level = f"{100.0 * details['confidence']:g} %"
+    table = Table("area", "m2", f"raised m3, {level}", f"lowered m3, {level}", f"net m3, {level}", box=None)
+    rows = [("all ground", details["whole"])]
+    rows += [(zone["name"], zone) for zone in details["zones"]]
+    rows += [(f"{band['lower_m']:g} to {band['upper_m']:g} m", band) for band in details["bands"]]
+    for name, budget in rows:
+        cells = []
+        for kind in ("raised", "lowered", "net"):
+            low, high = budget[f"volume_{kind}_interval_m3"]
+            cells.append(f"{budget[f'volume_{kind}_m3']:,.1f} ({low:,.1f} to {high:,.1f})")
+        table.add_row(name, f"{budget['area_observed_m2']:,.0f}", *cells)
+    return table
 
 
 def _asked(programme: Programme, epoch_id: str) -> Programme:

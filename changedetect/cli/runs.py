@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -80,7 +81,7 @@ def update(
     text: list[RenderableType] = []
     if result.run_id is None:
         text.append("Nothing to do: all models and products are up to date.")
-    text += _tables(programme)
+    text += [*_tables(programme), *_alignment_lines(programme)]
     text += [f"Warning: {warning}" for warning in _product_warnings(programme)]
     text += [f"Failed: {step['title']}: {step['error']['message']}" for step in failed]
     text.append(f"Maps lie in {directory / 'products'}")
@@ -101,7 +102,7 @@ def status(session: Session, directory: Directory, pairs: PairsOption = None) ->
     programme = session.open(directory, pairs=pairs.value if pairs else None)
     items = plan(programme)
     due = [item for item in items if item.is_due]
-    text = [*_tables(programme), *_due_lines(due)]
+    text = [*_tables(programme), *_alignment_lines(programme), *_due_lines(due)]
     if not due:
         text.append("All models and products are up to date.")
     document = {
@@ -182,6 +183,7 @@ def _overview(programme: Programme) -> dict[str, Any]:
                 "parent": record and record.parent,
                 "n_points": record and record.n_points,
                 "region": record and list(record.region),
+                "alignment": record and record.alignment and asdict(record.alignment),
                 "state": str(programme.state_directory(epoch.epoch_id)) if record else None,
             }
         )
@@ -214,13 +216,15 @@ def _product_warnings(programme: Programme) -> list[str]:
 def _tables(programme: Programme) -> list[RenderableType]:
     from rich.table import Table
 
-    epochs = Table("epoch", "date", "points", "model", "follows", box=None, pad_edge=False)
+    epochs = Table("epoch", "date", "points", "model", "follows", "aligned by", box=None, pad_edge=False)
     for epoch in programme.epochs:
         record = programme.intact_state_record(epoch.epoch_id)
         if record is None:
-            epochs.add_row(epoch.epoch_id, epoch.date_text, "", "not learned", "")
+            epochs.add_row(epoch.epoch_id, epoch.date_text, "", "not learned", "", "")
         else:
-            epochs.add_row(epoch.epoch_id, epoch.date_text, f"{record.n_points:,}", record.mode, record.parent or "")
+            aligned = "" if record.alignment is None else record.alignment.kind
+            points = f"{record.n_points:,}"
+            epochs.add_row(epoch.epoch_id, epoch.date_text, points, record.mode, record.parent or "", aligned)
     headings = ("change", "raised m3", "lowered m3", "net m3", "changed m2", "observed m2", "folder")
     changes = Table(*headings, box=None, pad_edge=False)
     for summary in _summaries(programme).values():
@@ -234,6 +238,20 @@ def _tables(programme: Programme) -> list[RenderableType]:
             summary["directory"],
         )
     return [table for table in (epochs, changes) if table.row_count]
+
+
+def _alignment_lines(programme: Programme) -> list[RenderableType]:
+    """How each epoch was aligned, and what to know about it."""
+    lines: list[RenderableType] = []
+    for epoch in programme.epochs:
+        record = programme.intact_state_record(epoch.epoch_id)
+        if record is None or record.alignment is None:
+            continue
+        alignment = record.alignment
+        if alignment.wording not in alignment.warnings:
+            lines.append(f"Aligned {epoch.epoch_id} to {alignment.reference}: {alignment.wording}")
+        lines += [f"Warning: {epoch.epoch_id}: {warning}" for warning in alignment.warnings]
+    return lines
 
 
 def _with_std(summary: dict[str, Any], name: str) -> str:

@@ -20,6 +20,7 @@ __all__ = [
     "PROGRAMME_FILE",
     "SECTIONS",
     "AdaptiveConfig",
+    "CoregistrationConfig",
     "DifferencingConfig",
     "Key",
     "LWPRConfig",
@@ -54,15 +55,19 @@ class AdaptiveConfig:
         Strength of the empirical-Bayes shrinkage of the local planes; 0 switches it off.
     prior_observations : float
         What a micro-cell remembers of earlier epochs counts for at most this many observations.
+    outlier_limit : float
+        An observation is left out as a gross error where the third nearest in height among those around it is this
+        many times further away than is common there; 0 keeps all.
     """
 
     cell_size_m: Annotated[float, Field(gt=0)] | None = None
     kernel_min_m: Annotated[float, Field(gt=0)] | None = None
     kernel_max_m: Annotated[float, Field(gt=0)] | None = None
-    kernel_ratio: Annotated[float, Field(gt=1, lt=4)] = 1.4142
+    kernel_ratio: Annotated[float, Field(gt=1, lt=4)] = 1.7
     lattice_spacing: Annotated[float, Field(gt=0, le=2)] = 0.8
     shrinkage: Annotated[float, Field(ge=0)] = 1.0
     prior_observations: Annotated[float, Field(gt=0)] = 1.0
+    outlier_limit: Annotated[float, Field(ge=0)] = 8.0
 
     def __post_init__(self) -> None:
         """Refuse an empty range of kernels."""
@@ -121,6 +126,28 @@ class LWPRConfig:
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
+class CoregistrationConfig:
+    """
+    How each new epoch is aligned to the surface of the first one.
+
+    Attributes
+    ----------
+    enabled : bool
+    transform : {"auto", "none", "vertical", "shift", "shift_tilt", "rigid", "rigid_scale"}
+        "auto" takes the simplest transform that suffices, and none, with a warning, where the epoch cannot be aligned;
+        "none" measures and reports the offset but moves nothing. Another kind is demanded: an epoch that does not
+        allow it is refused.
+    stable_areas : str or None
+        Vector file with polygons of ground that does not change, relative to the programme's folder; None: unchanged
+        ground is found.
+    """
+
+    enabled: bool = True
+    transform: Literal["auto", "none", "vertical", "shift", "shift_tilt", "rigid", "rigid_scale"] = "auto"
+    stable_areas: Annotated[str, Field(min_length=1)] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
 class DifferencingConfig:
     """
     Settings of the difference of two epochs.
@@ -171,7 +198,7 @@ class ProgrammeConfig:
     pairs : {"consecutive", "first", "all"}
         Which epochs `update` differences: neighbours in time and the first with the last; each with the first;
         every two.
-    adaptive, lwpr, differencing, machine
+    adaptive, lwpr, coregistration, differencing, machine
         The sections of the file.
     """
 
@@ -186,6 +213,7 @@ class ProgrammeConfig:
     pairs: Literal["consecutive", "first", "all"] = "consecutive"
     adaptive: AdaptiveConfig = Field(default_factory=AdaptiveConfig)
     lwpr: LWPRConfig = Field(default_factory=LWPRConfig)
+    coregistration: CoregistrationConfig = Field(default_factory=CoregistrationConfig)
     differencing: DifferencingConfig = Field(default_factory=DifferencingConfig)
     machine: MachineConfig = Field(default_factory=MachineConfig)
 
@@ -206,7 +234,7 @@ class ProgrammeConfig:
             "bounds": None if self.bounds is None else list(self.bounds),
             "model": self.model,
             "memory_days": self.memory_days,
-        }
+        } | _dotted("coregistration", self.coregistration)
         if self.model == "reference":
             return common | _dotted("lwpr", self.lwpr)
         return common | {"resolution": self.resolution} | _dotted("adaptive", self.adaptive)
@@ -243,6 +271,7 @@ def _fingerprint(settings: Mapping[str, Any]) -> str:
 SECTIONS: dict[str, type[Any]] = {
     "adaptive": AdaptiveConfig,
     "lwpr": LWPRConfig,
+    "coregistration": CoregistrationConfig,
     "differencing": DifferencingConfig,
     "machine": MachineConfig,
 }

@@ -161,7 +161,9 @@ class PointTransform:
         return InputDataError(msg)
 
 
-def make_transform(source: str, target: str, *, coordinate_epoch: float | None = None) -> PointTransform:
+def make_transform(
+    source: str, target: str, *, coordinate_epoch: float | None = None, has_heights: bool = True
+) -> PointTransform:
     """
     Find the way from one CRS to another.
 
@@ -171,6 +173,8 @@ def make_transform(source: str, target: str, *, coordinate_epoch: float | None =
     coordinate_epoch : float, decimal year, optional
         When the source's coordinates are valid; needed only between a dynamic frame (ITRF) and one fixed to a plate,
         where ignoring it costs centimetres a year.
+    has_heights : bool
+        False for outlines on the map, whose elevations mean nothing: vertical datums are not asked about.
 
     Returns
     -------
@@ -198,8 +202,9 @@ def make_transform(source: str, target: str, *, coordinate_epoch: float | None =
     source_crs, target_crs = parse_crs(source), parse_crs(target)
     check_located(source_crs, source)
     check_located(target_crs, target)
-    _check_heights_declared(source, target)
-    factor = height_ratio(vertical_crs(source_crs), vertical_crs(target_crs))
+    if has_heights:
+        _check_heights_declared(source, target)
+    factor = height_ratio(vertical_crs(source_crs), vertical_crs(target_crs)) if has_heights else 1.0
     transformer = None
     if factor is None:
         transformer = _find_transformer(source_crs, target_crs, source, target)

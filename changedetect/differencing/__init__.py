@@ -1,7 +1,26 @@
-"""Differences of two epochs: change, its standard deviation, significance and volumes."""
+"""Differences of two epochs: change, its errors and significance, volumes of areas, objects."""
 
+from changedetect.differencing.areas import AreaBudget, Quantity, area_budget, elevation_bands, sum_std
+from changedetect.differencing.coherent import CoherentTerm
+from changedetect.differencing.error_model import TooLittleGroundError
 from changedetect.differencing.maps import ChangeMaps
+from changedetect.differencing.objects import ChangeObject, ChangeObjects, find_objects_of_change
 from changedetect.differencing.pair import difference_models
 from changedetect.differencing.summary import summarise, systematic_offset
 
-__all__ = ["ChangeMaps", "difference_models", "summarise", "systematic_offset"]
+__all__ = [
+    "AreaBudget",
+    "ChangeMaps",
+    "ChangeObject",
+    "ChangeObjects",
+    "CoherentTerm",
+    "Quantity",
+    "TooLittleGroundError",
+    "area_budget",
+    "difference_models",
+    "elevation_bands",
+    "find_objects_of_change",
+    "sum_std",
+    "summarise",
+    "systematic_offset",
+]

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from changedetect.config import DifferencingConfig
+    from changedetect.differencing.coherent import CoherentTerm
+    from changedetect.differencing.error_model import ErrorModel
     from changedetect.typing import BoolArray, FloatArray
 
 __all__ = [
@@ -20,7 +23,9 @@ __all__ = [
     "OUTSIDE",
     "SURFACE_LOWERED",
     "SURFACE_RAISED",
+    "CellErrors",
     "ChangeMaps",
+    "Evidence",
     "judge_change",
 ]
 
@@ -31,6 +36,67 @@ SURFACE_RAISED = 2
 NOT_OBSERVED = 3
 #: Ground that no epoch saw.
 OUTSIDE = 255
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """
+    What the estimator of a difference says of every cell; arrays of shape (n_rows, n_cols), north up.
+
+    Attributes
+    ----------
+    difference, variance : array, m, m2
+        Later minus earlier, and its variance from independent errors of the observations.
+    freedom : array
+        Degrees of freedom of that variance.
+    counts : pair of array
+        Effective numbers of observations, earlier and later.
+    observed : pair of array, bool
+        Where each epoch observed the ground.
+    terrain : pair of array, m, 1
+        Elevation that both epochs share, and its slope.
+    correlation_length : float, m
+        Side of the square over which estimates of neighbouring cells share their data.
+    """
+
+    difference: FloatArray
+    variance: FloatArray
+    freedom: FloatArray
+    counts: tuple[FloatArray, FloatArray]
+    observed: tuple[BoolArray, BoolArray]
+    terrain: tuple[FloatArray, FloatArray]
+    correlation_length: float
+
+    @property
+    def known(self) -> BoolArray:
+        """Cells whose difference and variance are known and that both epochs observed."""
+        both: BoolArray = self.observed[0] & self.observed[1] & np.isfinite(self.difference) & (self.variance > 0.0)
+        return both
+
+
+@dataclass(frozen=True)
+class CellErrors:
+    """
+    Variance of every cell by source, and the model behind it.
+
+    Attributes
+    ----------
+    model : ErrorModel
+    correlated : array, shape (n_rows, n_cols), m2
+        Squared scale of the errors that are correlated over metres to hundreds of metres.
+    coherent : array, shape (n_rows, n_cols), m2
+        Variance of what co-registration leaves.
+    terms : tuple of CoherentTerm
+        Where the latter comes from.
+    stable : array, shape (n_rows, n_cols), bool
+        Ground the model was estimated on.
+    """
+
+    model: ErrorModel
+    correlated: FloatArray
+    coherent: FloatArray
+    terms: tuple[CoherentTerm, ...]
+    stable: BoolArray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +124,12 @@ class ChangeMaps:
         Effective number of observations of each epoch behind `dod`; 0 where there are none.
     correlation_length : float, m
         Side of the square over which estimates of neighbouring cells share their data.
+    local_std : array, m
+        Part of `dod_std` that is due to independent errors of the observations.
+    elevation : array, m
+        Elevation that both epochs share; NaN where `dod` is.
+    errors : CellErrors
+        The other parts, and the model of the errors.
     """
 
     dod: FloatArray
@@ -70,29 +142,19 @@ class ChangeMaps:
     n_effective_earlier: FloatArray
     n_effective_later: FloatArray
     correlation_length: float
+    local_std: FloatArray
+    elevation: FloatArray
+    errors: CellErrors
 
 
-def judge_change(
-    difference: FloatArray,
-    variance: FloatArray,
-    freedom: FloatArray,
-    counts: tuple[FloatArray, FloatArray],
-    observed: tuple[BoolArray, BoolArray],
-    correlation_length: float,
-    settings: DifferencingConfig,
-) -> ChangeMaps:
+def judge_change(evidence: Evidence, errors: CellErrors, settings: DifferencingConfig) -> ChangeMaps:
     """
-    Significance of a difference of known variance.
+    Significance of a difference of known errors.
 
     Parameters
     ----------
-    difference, variance, freedom : array, shape (n_rows, n_cols), m, m2, 1
-        Estimate, its variance and the degrees of freedom of that variance.
-    counts : pair of array, shape (n_rows, n_cols)
-        Effective numbers of observations, earlier and later.
-    observed : pair of array, bool
-        Where each epoch observed the ground.
-    correlation_length : float, m
+    evidence : Evidence
+    errors : CellErrors
     settings : DifferencingConfig
 
     Returns
@@ -103,15 +165,19 @@ def judge_change(
     -----
     With t the quantile of Student's distribution, level_of_detection = t std: the two-sided test at `confidence`. The
     probability of a change beyond the threshold is the mass of the t distribution about the estimate outside
-    (-threshold, threshold).
+    (-threshold, threshold). Degrees of freedom of the sum of variances follow Satterthwaite (1946). Where the tails
+    of the correlated errors are heavier than normal, std is the scale of a t distribution.
     """
-    both = observed[0] & observed[1] & np.isfinite(difference) & (variance > 0.0)
-    d = np.where(both, difference, np.nan)
-    std = np.sqrt(np.where(both, variance, np.nan))
-    nu = np.where(both, np.maximum(freedom, 1.0), np.nan)
-    lod = stats.t.ppf(0.5 + 0.5 * settings.confidence, nu) * std
+    both = evidence.known
+    d = np.where(both, evidence.difference, np.nan)
+    local = np.where(both, evidence.variance, np.nan)
+    variance = local + errors.correlated + errors.coherent
+    std = np.sqrt(variance)
+    nu = _combined_freedom(local, errors, variance, np.maximum(evidence.freedom, 1.0))
+    lod = _t_quantile(0.5 + 0.5 * settings.confidence, nu) * std
     threshold = settings.change_threshold_m
-    inside = np.asarray(stats.t.cdf((threshold - d) / std, nu) - stats.t.cdf((-threshold - d) / std, nu))
+    inside = special.stdtr(nu, (threshold - d) / std) - special.stdtr(nu, (-threshold - d) / std)
+    observed = evidence.observed
     classes = np.full(d.shape, OUTSIDE, np.uint8)
     classes[observed[0] | observed[1]] = NOT_OBSERVED
     classes[both] = BELOW_LEVEL_OF_DETECTION
@@ -125,7 +191,23 @@ def judge_change(
         change_class=classes,
         z_score=d / std,
         degrees_of_freedom=nu,
-        n_effective_earlier=np.where(observed[0], counts[0], 0.0),
-        n_effective_later=np.where(observed[1], counts[1], 0.0),
-        correlation_length=correlation_length,
+        n_effective_earlier=np.where(observed[0], evidence.counts[0], 0.0),
+        n_effective_later=np.where(observed[1], evidence.counts[1], 0.0),
+        correlation_length=evidence.correlation_length,
+        local_std=np.sqrt(local),
+        elevation=np.where(both, evidence.terrain[0], np.nan),
+        errors=errors,
     )
+
+
+def _combined_freedom(local: FloatArray, errors: CellErrors, variance: FloatArray, freedom: FloatArray) -> FloatArray:
+    tails = errors.model.scale.freedom
+    spread = local**2 / freedom + (0.0 if math.isinf(tails) else errors.correlated**2 / tails)
+    return np.asarray(variance**2 / spread)
+
+
+def _t_quantile(probability: float, freedom: FloatArray) -> FloatArray:
+    """Quantile of Student's t, interpolated in 1 / freedom; within 1e-4 of the exact one."""
+    inverse = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 400)])
+    table = np.concatenate([[stats.norm.ppf(probability)], stats.t.ppf(probability, 1.0 / inverse[1:])])
+    return np.asarray(np.interp(1.0 / freedom, inverse, table))

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from changedetect.differencing.areas import area_budget
 from changedetect.differencing.maps import (
     BELOW_LEVEL_OF_DETECTION,
     NOT_OBSERVED,
@@ -14,8 +14,10 @@ from changedetect.differencing.maps import (
     SURFACE_RAISED,
     ChangeMaps,
 )
+from changedetect.differencing.objects import find_objects_of_change
 
 if TYPE_CHECKING:
+    from changedetect.differencing.objects import ChangeObjects
     from changedetect.grid import Grid
     from changedetect.typing import JSONObject
 
@@ -27,7 +29,9 @@ _OFFSET_RATIO = 1.5
 _OFFSET_SHARE = 0.5
 
 
-def summarise(maps: ChangeMaps, grid: Grid) -> JSONObject:
+def summarise(
+    maps: ChangeMaps, grid: Grid, objects: ChangeObjects | None = None, confidence: float = 0.95
+) -> JSONObject:
     """
     Areas, volumes and robust statistics of a difference.
 
@@ -35,53 +39,60 @@ def summarise(maps: ChangeMaps, grid: Grid) -> JSONObject:
     ----------
     maps : ChangeMaps
     grid : Grid
+    objects : ChangeObjects, optional
+        Where change was found, which tells raised from lowered ground; by default they are found here, at a false
+        discovery rate of one less the confidence.
+    confidence : float
+        Of the intervals of the volumes.
 
     Returns
     -------
     summary : dict
-        Areas in m2, volumes in m3 with their standard deviations, changes in m. `volume_net` is the integral of the
-        difference over all ground both epochs observed; `volume_raised` - `volume_lowered` equals it. None
-        stands for what cannot be stated because no ground was observed twice.
+        Areas in m2, volumes in m3 with standard deviations and intervals, changes in m; `error_model` says what
+        errors were found, `objects` how many regions of change. None stands for what cannot be stated because no
+        ground was observed twice.
 
     Notes
     -----
-    Volumes use the estimate of every cell, since keeping only significant cells biases them. Summing positive and
-    negative parts apart would count noise as both cut and fill: where no change was detected the smaller of the two
-    sums is taken for noise and off both. Standard deviations hold the local noise alone: cells closer than
-    `maps.correlation_length` share their data, cells further apart count as independent.
+    Volumes use the estimate of every cell, since keeping only significant cells biases them, see `area_budget`.
     """
+    if objects is None:
+        objects = find_objects_of_change(maps, grid.resolution, confidence, 1.0 - confidence)
     area = grid.resolution**2
     both = np.isfinite(maps.dod)
     classes = maps.change_class
-    d, std = maps.dod[both], maps.dod_std[both]
-    quiet = classes[both] == BELOW_LEVEL_OF_DETECTION
-    rectified = area * float(min(np.sum(d[quiet & (d > 0.0)]), -np.sum(d[quiet & (d < 0.0)])))
+    d = maps.dod[both]
     median = float(np.median(d)) if d.size else None
+    budget = area_budget(maps, grid.resolution, confidence, None, objects.direction)
+    volumes = {key: value for key, value in budget.document().items() if key.startswith("volume")}
     return {
         "resolution_m": grid.resolution,
         "area_observed_m2": area * int(both.sum()),
         "area_raised_m2": area * int(np.count_nonzero(classes == SURFACE_RAISED)),
         "area_lowered_m2": area * int(np.count_nonzero(classes == SURFACE_LOWERED)),
-        "area_below_level_of_detection_m2": area * int(quiet.sum()),
+        "area_below_level_of_detection_m2": area * int(np.count_nonzero(classes == BELOW_LEVEL_OF_DETECTION)),
         "area_not_observed_m2": area * int(np.count_nonzero(classes == NOT_OBSERVED)),
-        "volume_raised_m3": max(area * float(np.sum(d[d > 0.0])) - rectified, 0.0),
-        "volume_raised_std_m3": _volume_std(std[d > 0.0], area, maps.correlation_length),
-        "volume_lowered_m3": max(-area * float(np.sum(d[d < 0.0])) - rectified, 0.0),
-        "volume_lowered_std_m3": _volume_std(std[d < 0.0], area, maps.correlation_length),
-        "volume_net_m3": area * float(np.sum(d)),
-        "volume_net_std_m3": _volume_std(std, area, maps.correlation_length),
+        **volumes,
         "change_median_m": median,
         "change_nmad_m": None if median is None else 1.4826 * float(np.median(np.abs(d - median))),
         "change_minimum_m": float(d.min()) if d.size else None,
         "change_maximum_m": float(d.max()) if d.size else None,
         "level_of_detection_median_m": float(np.median(maps.level_of_detection[both])) if d.size else None,
         "systematic_offset_m": systematic_offset(maps),
+        "error_model": maps.errors.model.document(),
+        "objects": _count(objects),
     }
 
 
-def _volume_std(std: np.typing.NDArray[np.float64], area: float, correlation_length: float) -> float:
-    shared = max(1.0, correlation_length**2 / area)
-    return area * math.sqrt(shared * float(np.sum(std**2)))
+def _count(objects: ChangeObjects) -> JSONObject:
+    raised = [item for item in objects.items if item.is_raised]
+    lowered = [item for item in objects.items if not item.is_raised]
+    return {
+        "n_raised": len(raised),
+        "n_lowered": len(lowered),
+        "area_raised_m2": float(sum(item.area for item in raised)),
+        "area_lowered_m2": float(sum(item.area for item in lowered)),
+    }
 
 
 def systematic_offset(maps: ChangeMaps) -> float | None:

@@ -34,7 +34,7 @@ from changedetect.pointcloud import PointCloud
 from changedetect.storage import atomic_path
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from datetime import date
     from pathlib import Path
 
@@ -155,7 +155,15 @@ class LasSource(PointSource):
             logger.info("%s: %d of %d points used; classes in the file: %s", self.path, n_kept, n_read, present)
 
 
-def write_points(path: Path, cloud: PointCloud, crs: str, *, scale: float = 0.001, created: date | None = None) -> None:
+def write_points(
+    path: Path,
+    cloud: PointCloud,
+    crs: str,
+    *,
+    scale: float = 0.001,
+    created: date | None = None,
+    extra: Mapping[str, tuple[NDArray[Any], str]] | None = None,
+) -> None:
     """
     Write a point cloud as LAZ (or LAS, by the suffix), atomically.
 
@@ -172,6 +180,9 @@ def write_points(path: Path, cloud: PointCloud, crs: str, *, scale: float = 0.00
         Coordinates are rounded to this.
     created : date, optional
         Creation date in the header; today by default. With a fixed date the same points give the same bytes.
+    extra : mapping of str to (array, str), optional
+        Further dimensions by name: one value a point, stored in the array's type, and a description of at most 32
+        characters.
 
     Raises
     ------
@@ -199,6 +210,8 @@ def write_points(path: Path, cloud: PointCloud, crs: str, *, scale: float = 0.00
     header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(_wkt_for_las(crs)))
     if cloud.sigma is not None:
         header.add_extra_dim(laspy.ExtraBytesParams(SIGMA_DIMENSION, np.float32, "standard deviation of z"))
+    for name, (values, description) in (extra or {}).items():
+        header.add_extra_dim(laspy.ExtraBytesParams(name, values.dtype, description))
     integers = [np.rint((v - offset) / scale) for v, offset in zip(columns, header.offsets, strict=True)]
     if max(float(values.max()) for values in integers) > _MAX_INT32:
         msg = (
@@ -213,6 +226,8 @@ def write_points(path: Path, cloud: PointCloud, crs: str, *, scale: float = 0.00
         record.classification[:] = cloud.classification
     if cloud.sigma is not None:
         record[SIGMA_DIMENSION] = cloud.sigma.astype(np.float32)
+    for name, (values, _) in (extra or {}).items():
+        record[name] = values
     with atomic_path(path) as temporary:
         _write(temporary, path, header, record)
 

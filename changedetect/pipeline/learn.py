@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+
 import changedetect
-from changedetect.catalogue import Epoch, Programme, SourceRecord, StateRecord, describe_files, own_state_reasons
+from changedetect.catalogue import (
+    AlignmentRecord,
+    Epoch,
+    Programme,
+    SourceRecord,
+    StateRecord,
+    describe_files,
+    own_state_reasons,
+)
 from changedetect.errors import ModelStateError
 from changedetect.models.lwpr import LWPRSurface
 from changedetect.models.reference import ReferenceLWPR
 from changedetect.models.registry import create_model, load_model
+from changedetect.pipeline.alignment import align_epoch
 from changedetect.pipeline.manifest import utc_now
 from changedetect.pipeline.reading import read_epoch_points
 from changedetect.storage import atomic_directory
@@ -26,10 +37,11 @@ Model: TypeAlias = LWPRSurface | ReferenceLWPR
 
 @dataclass(frozen=True)
 class _Learned:
-    """A model, the sources its epoch was learned from, and whether they were read again."""
+    """A model, the sources its epoch was learned from, how they were aligned, and whether they were read again."""
 
     model: Model
     sources: tuple[SourceRecord, ...]
+    alignment: AlignmentRecord | None
     n_points: int
     origin: Literal["sources", "stored evidence"]
 
@@ -42,7 +54,7 @@ class ModelShelf:
     ----------
     programme : Programme
     capacity : int
-        Two epochs of a difference and the next one.
+        Two epochs of a difference, and the first, which the others are aligned to.
     """
 
     def __init__(self, programme: Programme, capacity: int = 3) -> None:
@@ -72,7 +84,9 @@ class ModelShelf:
         return self._models[epoch_id]
 
 
-def learn_epoch(programme: Programme, epoch: Epoch, parent: Epoch | None, models: ModelShelf) -> dict[str, Any]:
+def learn_epoch(
+    programme: Programme, epoch: Epoch, parent: Epoch | None, reference_id: str | None, models: ModelShelf
+) -> dict[str, Any]:
     """
     Learn the model of an epoch and put it in place of an older one, whole.
 
@@ -82,8 +96,10 @@ def learn_epoch(programme: Programme, epoch: Epoch, parent: Epoch | None, models
     epoch : Epoch
     parent : Epoch or None
         The epoch before, learned already; None where this is the first.
+    reference_id : str or None
+        The first epoch, which later ones are aligned to; None where this is it.
     models : ModelShelf
-        Gives the parent's model, receives the new one.
+        Gives the models of these, receives the new one.
 
     Returns
     -------
@@ -98,30 +114,47 @@ def learn_epoch(programme: Programme, epoch: Epoch, parent: Epoch | None, models
     Notes
     -----
     Where nothing but the parent has changed, the model is put on its new parent from its own evidence, without reading
-    the sources again, if its kind keeps evidence.
+    the sources again, if its kind keeps evidence. Evidence is that of the aligned points; it stays valid because the
+    alignment follows from the sources of this and the first epoch and from the settings alone, not from the epochs in
+    between, whose memory the model of the first epoch does not have.
     """
-    learned = _rebuild(programme, epoch, parent, models) or _learn_points(programme, epoch, parent, models)
+    learned = _rebuild(programme, epoch, parent, reference_id, models)
+    learned = learned or _learn_points(programme, epoch, parent, reference_id, models)
     _write_state(programme, epoch, parent, learned)
     models.put(epoch.epoch_id, learned.model)
     return {
         "parent": parent.epoch_id if parent else None,
         "n_points": learned.n_points,
         "origin": learned.origin,
+        "alignment": None if learned.alignment is None else asdict(learned.alignment),
+        "warnings": [] if learned.alignment is None else list(learned.alignment.warnings),
         "sources": [{"uri": item.uri, "sha256": item.sha256, "n_used": item.n_used} for item in learned.sources],
     }
 
 
-def _learn_points(programme: Programme, epoch: Epoch, parent: Epoch | None, models: ModelShelf) -> _Learned:
+def _learn_points(
+    programme: Programme, epoch: Epoch, parent: Epoch | None, reference_id: str | None, models: ModelShelf
+) -> _Learned:
     points = read_epoch_points(programme, epoch)
+    cloud, alignment = points.cloud, None
     model = models.get(parent.epoch_id).copy() if parent else create_model(programme.config)
-    cloud = points.cloud
+    if isinstance(model, LWPRSurface):
+        kept = model.without_gross_errors(cloud.coordinates, cloud.elevation)
+        if not kept.all():
+            n_left_out = int(kept.size - np.count_nonzero(kept))
+            logger.info("%s: %d of %d points stand alone and are left out.", epoch.epoch_id, n_left_out, kept.size)
+            cloud = cloud.select(kept)
+    if reference_id is not None and programme.config.coregistration.enabled:
+        cloud, alignment = align_epoch(programme, epoch, reference_id, cloud, models.get(reference_id))
     model.partial_fit(cloud.coordinates, cloud.elevation, cloud.sigma, epoch.survey_time)
-    return _Learned(model, points.records, len(cloud), "sources")
+    return _Learned(model, points.records, alignment, len(points.cloud), "sources")
 
 
-def _rebuild(programme: Programme, epoch: Epoch, parent: Epoch | None, models: ModelShelf) -> _Learned | None:
+def _rebuild(
+    programme: Programme, epoch: Epoch, parent: Epoch | None, reference_id: str | None, models: ModelShelf
+) -> _Learned | None:
     """Put the epoch's stored model on its new parent; None where the sources have to be read."""
-    if own_state_reasons(programme, epoch):
+    if own_state_reasons(programme, epoch, reference_id):
         return None
     found = programme.state_record(epoch.epoch_id)
     try:
@@ -132,7 +165,9 @@ def _rebuild(programme: Programme, epoch: Epoch, parent: Epoch | None, models: M
     parent_model = models.get(parent.epoch_id) if parent else None
     if found is None or not isinstance(model, LWPRSurface) or not isinstance(parent_model, LWPRSurface | None):
         return None
-    return _Learned(model.rebuilt_on(parent_model), found[0].sources, found[0].n_points, "stored evidence")
+    record = found[0]
+    rebuilt = model.rebuilt_on(parent_model)
+    return _Learned(rebuilt, record.sources, record.alignment, record.n_points, "stored evidence")
 
 
 def _write_state(programme: Programme, epoch: Epoch, parent: Epoch | None, learned: _Learned) -> None:
@@ -150,6 +185,7 @@ def _write_state(programme: Programme, epoch: Epoch, parent: Epoch | None, learn
             learning_sha256=config.learning_sha256,
             config_sha256=config.config_sha256,
             sources=learned.sources,
+            alignment=learned.alignment,
             n_points=learned.n_points,
             region=learned.model.region,
             files=describe_files(temporary),

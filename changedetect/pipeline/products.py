@@ -10,26 +10,26 @@ import numpy as np
 
 import changedetect
 from changedetect.catalogue import ChangeProduct, ProductRecord, Programme, describe_files
-from changedetect.config import ProgrammeConfig
-from changedetect.differencing import difference_models, summarise
-from changedetect.errors import ConfigError, ModelStateError
+from changedetect.errors import ModelStateError
 from changedetect.grid import Grid
-from changedetect.io.netcdf import CHANGE_LAYERS, SURFACE_LAYERS
+from changedetect.io.geopackage import write_objects
+from changedetect.io.netcdf import CHANGE_LAYERS
 from changedetect.io.products import (
     ChangeMetadata,
     SurfaceMetadata,
     write_change_products,
     write_epoch_products,
 )
-from changedetect.models.base import SurfaceModel
 from changedetect.pipeline.colours import change_limits, programme_limits, surface_limits
 from changedetect.pipeline.learn import ModelShelf
 from changedetect.pipeline.manifest import utc_now
-from changedetect.pipeline.regions import join_regions
+from changedetect.pipeline.pairs import difference_pair
+from changedetect.pipeline.rasters import predict_layers, product_grid
 from changedetect.storage import read_json, write_json
-from changedetect.typing import FloatArray, JSONObject, Region
+from changedetect.typing import JSONObject
 
 __all__ = [
+    "OBJECTS_FILE",
     "SUMMARY_FILE",
     "make_epoch_products",
     "make_pair_products",
@@ -41,64 +41,11 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 SUMMARY_FILE = "summary.json"
+OBJECTS_FILE = "objects.gpkg"
 #: Version of the layout of `summary.json`.
 SUMMARY_FORMAT_VERSION = 1
-#: Cells predicted at a time, along each side.
-#: A raster of more cells is refused: 20 000 x 20 000.
-_MAX_CELLS = 4e8
-_BLOCK = 512
 #: Names the rasters have in `ChangeMaps` where they differ.
 _MAP_NAMES = {"n_observations_earlier": "n_effective_earlier", "n_observations_later": "n_effective_later"}
-
-
-def product_grid(
-    config: ProgrammeConfig, region: Region, *, resolution: float | None = None, bounds: Region | None = None
-) -> Grid:
-    """
-    Return the grid of a product: the bounds given, the programme's, or else `region`, snapped outwards.
-
-    All grids of a resolution have their cell borders on its multiples, so that rasters of different epochs overlay
-    cell by cell even where their extents differ.
-
-    Raises
-    ------
-    ConfigError
-        Resolution or bounds enclose nothing, or the raster would be too large to be meant.
-    """
-    cell = config.resolution if resolution is None else resolution
-    west, east, south, north = bounds or config.bounds or region
-    if not cell > 0.0:
-        msg = f"The resolution must be above zero, not {cell:g} m."
-        raise ConfigError(msg)
-    if not (west < east and south < north):
-        msg = f"Bounds are west east south north with west < east and south < north, not {west} {east} {south} {north}."
-        raise ConfigError(msg)
-    n_cells = (east - west) * (north - south) / cell**2
-    if n_cells > _MAX_CELLS:
-        size = f"{east - west:,.0f} m x {north - south:,.0f} m at {cell:g} m"
-        msg = (
-            f"A raster of {size} has {n_cells:,.0f} cells; at most {_MAX_CELLS:,.0f} are made. Set bounds in "
-            "programme.toml (are there stray points far from the site?) or a coarser resolution."
-        )
-        raise ConfigError(msg)
-    return Grid.from_region((west, east, south, north), cell, config.crs)
-
-
-def predict_layers(model: SurfaceModel, grid: Grid) -> dict[str, FloatArray]:
-    """
-    Evaluate a surface at the cell centres of a grid.
-
-    Returns
-    -------
-    layers : dict of name to array, shape (n_rows, n_cols), float64
-        The fields of `Prediction`.
-    """
-    layers = {name: np.full(grid.shape, np.nan) for name in SURFACE_LAYERS}
-    for rows, cols, block in grid.blocks(_BLOCK):
-        prediction = model.predict(block.coordinates())
-        for name, layer in layers.items():
-            layer[rows, cols] = getattr(prediction, name).reshape(block.shape)
-    return layers
 
 
 def make_epoch_products(
@@ -146,7 +93,9 @@ def make_pair_products(
     programme: Programme, pair: ChangeProduct, models: ModelShelf, run_id: str, directory: Path | None = None
 ) -> JSONObject:
     """
-    Write the rasters and the summary of the difference of two epochs; parameters as `make_epoch_products`.
+    Write the rasters, the objects and the summary of the difference of two epochs.
+
+    Parameters are those of `make_epoch_products`.
 
     Returns
     -------
@@ -155,10 +104,8 @@ def make_pair_products(
         `summary.json` says.
     """
     config = programme.config
-    earlier, later = models.get(pair.earlier), models.get(pair.later)
-    grid = product_grid(config, join_regions(earlier.region, later.region))
-    maps = difference_models(earlier, later, grid, config.differencing)
-    statistics = summarise(maps, grid)
+    difference = difference_pair(programme, pair.earlier, pair.later, models)
+    grid, maps, objects, statistics = difference.grid, difference.maps, difference.objects, difference.summary
     warning = offset_warning(statistics)
     warnings = (warning,) if warning else ()
     epochs = [programme.epoch(pair.earlier), programme.epoch(pair.later)]
@@ -194,6 +141,7 @@ def make_pair_products(
     )
 
     def add_files(folder: Path) -> None:
+        write_objects(folder / OBJECTS_FILE, objects, grid, epochs=(pair.earlier, pair.later))
         write_json(folder / SUMMARY_FILE, summary)
         add_manifest(folder)
 

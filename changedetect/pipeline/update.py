@@ -142,7 +142,10 @@ class _Update:
         reasons = state_reasons(self.programme, epoch, parent, self._states)
         if reasons:
             with self._step(Item("model", epoch.epoch_id, reasons)) as details:
-                details.update(learn_epoch(self.programme, epoch, parent, self.models))
+                reference_id = next(iter(self._states), None)
+                details.update(learn_epoch(self.programme, epoch, parent, reference_id, self.models))
+                for warning in details["warnings"]:
+                    self.run.warn(f"{epoch.epoch_id}: {warning}")
             if self.run.steps[-1]["status"] == "failed":
                 return False
         record = self.programme.state_record(epoch.epoch_id)

@@ -1,0 +1,84 @@
+"""Errors that whole maps share: what co-registration leaves of shifts, tilts and datum steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from changedetect.typing import FloatArray
+
+__all__ = ["CoherentTerm"]
+
+
+@dataclass(frozen=True)
+class CoherentTerm:
+    """
+    An error that is a linear function of a few uncertain parameters.
+
+    Attributes
+    ----------
+    design : array, shape (n_rows * n_cols, k)
+        Derivative of the difference of every cell, row by row from the north-west, in each parameter.
+    covariance : array, shape (k, k)
+        Of the parameters; the units of design times root of covariance are m.
+
+    Raises
+    ------
+    ValueError
+        Shapes do not match, or a variance is negative or not finite.
+
+    Notes
+    -----
+    A shift (de, dn, du) of the later epoch has rows (-df/de, -df/dn, 1) with the slopes of the terrain.
+    """
+
+    design: FloatArray
+    covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        k = self.covariance.shape[0]
+        if self.design.ndim != 2 or self.covariance.shape != (k, k) or self.design.shape[1] != k:
+            msg = (
+                f"a coherent term has a design of shape (n_cells, k) and a covariance of shape (k, k); got "
+                f"{self.design.shape} and {self.covariance.shape}"
+            )
+            raise ValueError(msg)
+        if not np.isfinite(self.covariance).all() or (np.diag(self.covariance) < 0.0).any():
+            msg = "the covariance of a coherent term holds values that are not finite or variances below zero"
+            raise ValueError(msg)
+
+    def variance(self, shape: tuple[int, int]) -> FloatArray:
+        """
+        Variance of every cell, m2.
+
+        Parameters
+        ----------
+        shape : (n_rows, n_cols)
+
+        Raises
+        ------
+        ValueError
+            The design is of another number of cells.
+        """
+        if self.design.shape[0] != shape[0] * shape[1]:
+            msg = f"a coherent term describes {self.design.shape[0]} cells; the map has {shape[0]} x {shape[1]}"
+            raise ValueError(msg)
+        quadratic = np.einsum("ij,jk,ik->i", self.design, self.covariance, self.design)
+        return np.asarray(quadratic.reshape(shape))
+
+    def variance_of_sum(self, weights: FloatArray) -> float:
+        """
+        Variance of a weighted sum over all cells.
+
+        Parameters
+        ----------
+        weights : array, shape (n_rows, n_cols)
+            Zero where the difference is not known.
+        """
+        flat = weights.ravel()
+        used = np.flatnonzero(flat)
+        gradient = flat[used] @ self.design[used]
+        return float(gradient @ self.covariance @ gradient)

@@ -1,0 +1,197 @@
+"""Areas of interest from vector files: polygons in the programme's CRS, and the cells they cover."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyogrio
+import shapely
+from pyogrio.errors import DataLayerError, DataSourceError
+from rasterio.features import rasterize
+from rasterio.transform import Affine
+
+from changedetect.crs import horizontal_part, make_transform
+from changedetect.errors import CRSMismatchError, InputDataError, MissingInputError
+
+if TYPE_CHECKING:
+    from changedetect.grid import Grid
+    from changedetect.typing import BoolArray, FloatArray
+
+__all__ = ["Zone", "covered_cells", "read_zones"]
+
+#: Columns a zone's name is taken from, the first that exists; upper and lower case are the same.
+_NAME_COLUMNS = ("name", "zone", "label", "title", "id", "location")
+_FIX = "Open the file in QGIS, run 'Fix geometries' or delete the feature, and save it again."
+
+
+@dataclass(frozen=True)
+class Zone:
+    """
+    An area of interest.
+
+    Attributes
+    ----------
+    name : str
+        Unique in its file.
+    polygon : shapely.Polygon or shapely.MultiPolygon
+        In the programme's CRS, m.
+    """
+
+    name: str
+    polygon: shapely.Polygon | shapely.MultiPolygon
+
+
+def read_zones(path: Path, crs: str, *, layer: str | None = None, name_column: str | None = None) -> tuple[Zone, ...]:
+    """
+    Read polygons from a GeoPackage, GeoJSON, shapefile or any other vector file.
+
+    Parameters
+    ----------
+    path : path
+    crs : str
+        CRS of the programme; zones in another are reprojected.
+    layer : str, optional
+        Needed where the file has several layers.
+    name_column : str, optional
+        Column that holds the names; otherwise a column called name, zone, label, title, id or location, else numbers.
+
+    Returns
+    -------
+    zones : tuple of Zone
+        In the order of the file.
+
+    Raises
+    ------
+    MissingInputError
+        There is no such file.
+    InputDataError
+        The file is no vector file, has several layers and none is named, no features, or a feature that is empty,
+        invalid or no polygon; the message names the feature.
+    CRSMismatchError
+        The file states no CRS, or one that cannot be reached.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> text = '{"type": "Polygon", "coordinates": [[[9.0, 48.0], [9.1, 48.0], [9.1, 48.1], [9.0, 48.0]]]}'
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "zone.geojson"
+    ...     _ = file.write_text('{"type": "Feature", "properties": {"name": "slip"}, "geometry": ' + text + "}")
+    ...     zone = read_zones(file, "EPSG:32632")[0]
+    >>> zone.name, round(zone.polygon.area / 1e6)
+    ('slip', 41)
+    """
+    path = Path(path)
+    if not path.exists():
+        msg = f"'{path}' does not exist. Name a GeoPackage, GeoJSON or shapefile with polygons."
+        raise MissingInputError(msg)
+    meta, geometries, columns = _read(path, _only_layer(path, layer))
+    source = meta["crs"]
+    if source is None:
+        msg = f"'{path}' states no coordinate reference system. Assign one in QGIS (Layer > Set CRS) and save it."
+        raise CRSMismatchError(msg)
+    if len(geometries) == 0:
+        msg = f"'{path}' holds no features; polygons are expected."
+        raise InputDataError(msg)
+    transform = make_transform(horizontal_part(source), horizontal_part(crs), has_heights=False)
+
+    def projected(vertices: FloatArray) -> FloatArray:
+        easting, northing, _ = transform(vertices[:, 0], vertices[:, 1], np.zeros(len(vertices)))
+        return np.column_stack([easting, northing])
+
+    names = _names(path, list(meta["fields"]), columns, len(geometries), name_column)
+    zones = []
+    for number, (name, binary) in enumerate(zip(names, geometries, strict=True), start=1):
+        polygon = _checked(path, number, name, binary)
+        zones.append(Zone(name, shapely.transform(polygon, projected)))
+    return tuple(zones)
+
+
+def covered_cells(
+    polygon: shapely.Polygon | shapely.MultiPolygon, grid: Grid
+) -> tuple[tuple[slice, slice], BoolArray] | None:
+    """
+    Cells of a grid whose centres lie in a polygon.
+
+    Parameters
+    ----------
+    polygon : Polygon or MultiPolygon
+        In the CRS of the grid.
+    grid : Grid
+
+    Returns
+    -------
+    window : pair of slice
+        Rows and columns that hold them.
+    inside : array, shape of the window, bool
+        None instead of both where the polygon lies outside the grid.
+    """
+    west, south, east, north = polygon.bounds
+    part = grid.intersection((west, east, south, north))
+    if part is None:
+        return None
+    inside = rasterize([(polygon, 1)], out_shape=part.shape, transform=Affine(*part.transform), dtype="uint8") > 0
+    row = round((grid.north - part.north) / grid.resolution)
+    column = round((part.west - grid.west) / grid.resolution)
+    return (slice(row, row + part.n_rows), slice(column, column + part.n_cols)), np.asarray(inside)
+
+
+def _only_layer(path: Path, layer: str | None) -> str | None:
+    try:
+        available = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
+    except DataSourceError as error:
+        msg = f"'{path}' cannot be read as a vector file: {error}"
+        raise InputDataError(msg) from error
+    if layer is None and len(available) > 1:
+        msg = (
+            f"'{path}' has {len(available)} layers ({', '.join(available)}); save the one to use in a file of its own."
+        )
+        raise InputDataError(msg)
+    if layer is not None and layer not in available:
+        msg = f"'{path}' has no layer '{layer}'; it has {', '.join(available) or 'none'}."
+        raise InputDataError(msg)
+    return layer
+
+
+def _read(path: Path, layer: str | None) -> tuple[dict[str, Any], Any, list[Any]]:
+    try:
+        meta, _, geometries, columns = pyogrio.raw.read(path, layer=layer)
+    except (DataSourceError, DataLayerError) as error:
+        msg = f"'{path}' cannot be read as a vector file: {error}"
+        raise InputDataError(msg) from error
+    if geometries is None:
+        msg = f"'{path}' holds a table without geometries; polygons are expected."
+        raise InputDataError(msg)
+    return meta, geometries, list(columns)
+
+
+def _names(path: Path, fields: list[str], columns: list[Any], n: int, name_column: str | None) -> list[str]:
+    """One name a feature, made unique by its number where it occurs twice or is missing."""
+    if name_column is not None and name_column not in fields:
+        msg = f"'{path}' has no column '{name_column}'; it has {', '.join(fields) or 'none'}."
+        raise InputDataError(msg)
+    lower = [field.lower() for field in fields]
+    found = name_column or next((fields[lower.index(c)] for c in _NAME_COLUMNS if c in lower), None)
+    if found is None:
+        return [str(k) for k in range(1, n + 1)]
+    names = ["" if v is None else str(v).strip() for v in columns[fields.index(found)]]
+    return [name if name and names.count(name) == 1 else f"{name} {k}".strip() for k, name in enumerate(names, start=1)]
+
+
+def _checked(path: Path, number: int, name: str, binary: bytes | None) -> shapely.Polygon | shapely.MultiPolygon:
+    geometry = None if binary is None else shapely.force_2d(shapely.from_wkb(binary))
+    what = f"'{path}': feature {number} ('{name}')"
+    if geometry is None or geometry.is_empty:
+        msg = f"{what} has no geometry. {_FIX}"
+        raise InputDataError(msg)
+    if not isinstance(geometry, shapely.Polygon | shapely.MultiPolygon):
+        msg = f"{what} is a {geometry.geom_type}; zones are polygons. {_FIX}"
+        raise InputDataError(msg)
+    if not geometry.is_valid:
+        reason = shapely.is_valid_reason(geometry)
+        msg = f"{what} is not a valid polygon: {reason}. {_FIX}"
+        raise InputDataError(msg)
+    return geometry

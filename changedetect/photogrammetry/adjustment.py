@@ -1,0 +1,433 @@
+"""
+Bundle adjustment: poses, lens and points that explain all observations and the navigation together.
+
+Levenberg-Marquardt on the reduced camera system (`changedetect.kernels.bundle`), with a robust loss by iterated weights
+[1]_, pose priors with their correlation in time (`priors`), and as many lens parameters as the photos determine.
+
+References
+----------
+.. [1] Holland, Welsch (1977), Robust regression using iteratively reweighted least-squares,
+   doi:10.1080/03610927708827533.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
+from scipy.spatial.transform import Rotation
+
+from changedetect.errors import InputDataError
+from changedetect.kernels.bundle import point_steps, reduced_system
+from changedetect.kernels.projection import N_CALIBRATION
+from changedetect.photogrammetry.block import ImageBlock, Observations
+from changedetect.photogrammetry.covariance import PixelCorrelation, pixel_correlation
+from changedetect.photogrammetry.priors import boresight_pattern
+from changedetect.photogrammetry.triangulation import residuals, triangulate
+from changedetect.typing import BoolArray, FloatArray
+
+__all__ = ["LENS_PARAMETERS", "Adjustment", "AdjustmentSettings", "adjust"]
+
+logger = logging.getLogger(__name__)
+
+#: Names of the lens parameters, in the order of the unknowns.
+LENS_PARAMETERS = ("focal", "cx", "cy", "k1", "k2")
+#: Cauchy's constant with 95 % efficiency on normal errors.
+_CAUCHY = 2.385
+_MAX_ITERATIONS = 12
+#: Relative change of the cost at which steps have become far smaller than their standard errors.
+_CONVERGED = 1e-4
+#: Squared deviation from navigation per pose parameter that correlated pixel errors alone do not explain.
+_CONTRADICTION = 20.0
+#: Pixels are never taken for more exact than this, pixels.
+_MIN_SIGMA = 0.01
+#: Nor for worse than this many times what was stated: larger residuals speak against the poses, not the pixels.
+_MAX_SIGMA_RATIO = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdjustmentSettings:
+    """
+    What is adjusted, and how.
+
+    Attributes
+    ----------
+    lens : tuple of str
+        Parameters estimated, of `LENS_PARAMETERS`; the others stay as given.
+    lens_std : tuple of 5 float
+        How well the given lens is known: relative focal length, cx and cy in pixels, k1, k2.
+    boresight_std : float, rad
+        How well the mounting angles are known; 0 takes them as exact.
+    rounds : int
+        Adjustments, each followed by the removal of gross errors and a new estimate of the pixel noise.
+    max_error : float
+        Observations are removed beyond this many standard deviations.
+    min_views : int
+        Points with fewer views after that are removed.
+    """
+
+    lens: tuple[str, ...] = ()
+    lens_std: tuple[float, float, float, float, float] = (0.01, 10.0, 10.0, 0.05, 0.1)
+    boresight_std: float = 0.0
+    rounds: int = 3
+    max_error: float = 4.0
+    min_views: int = 2
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """
+    Result of a bundle adjustment.
+
+    Attributes
+    ----------
+    block : ImageBlock
+        Adjusted poses and lenses.
+    points : array, shape (n_points, 3), ENU, m
+    observations : Observations
+        Those kept, with the standard deviations estimated.
+    weight : array, shape (n,), 1 / pixels^2
+        Robust weights of the last iteration.
+    origin : array, shape (n_points,), int64
+        Number of each point among the observations given.
+    camera_covariance : array, shape (6 n_images + 5 n_lenses, 6 n_images + 5 n_lenses)
+        Marginal covariance of poses and lenses; zero for what was not adjusted.
+    lens_correction, lens_std : array, shape (n_lenses, 5)
+        Added to the lens given, and its standard error; of log focal length, cx, cy, k1, k2.
+    boresight, boresight_std : array, shape (n_flights, 3), rad
+        Correction of the mounting angles about the camera's axes, and its standard error.
+    pose_correction : array, shape (n_images, 6), m and rad
+        Adjusted minus given.
+    correlation : PixelCorrelation
+        Of the residuals within photos; weights of the images against the priors, and covariances, heed it.
+    prior_chi2 : float
+        Squared deviation of poses from navigation, in units of its covariance, per pose parameter; about one or less
+        where both agree.
+    """
+
+    block: ImageBlock
+    points: FloatArray
+    observations: Observations
+    weight: FloatArray
+    origin: np.ndarray[Any, np.dtype[np.int64]]
+    camera_covariance: FloatArray
+    lens_correction: FloatArray
+    lens_std: FloatArray
+    boresight: FloatArray
+    boresight_std: FloatArray
+    pose_correction: FloatArray
+    correlation: PixelCorrelation
+    prior_chi2: float = 0.0
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Measured minus projected pixels, shape (n, 2)."""
+        return residuals(self.block, self.points, self.observations)
+
+
+def adjust(
+    block: ImageBlock,
+    observations: Observations,
+    information: FloatArray,
+    settings: AdjustmentSettings | None = None,
+    *,
+    start: ImageBlock | None = None,
+    on_round: Callable[[], None] | None = None,
+) -> Adjustment:
+    """
+    Adjust a block.
+
+    Parameters
+    ----------
+    block : ImageBlock
+        Poses and lenses given: the centre of the priors.
+    observations : Observations
+    information : array, shape (6 n_images, 6 n_images)
+        Of the given poses, from `pose_information`; block diagonal over flights.
+    settings : AdjustmentSettings, optional
+    start : ImageBlock, optional
+        Poses to begin with, from an earlier adjustment; those given by default. Its lenses are not used.
+    on_round : callable, optional
+        Called after each round.
+
+    Raises
+    ------
+    InputDataError
+        No point is seen by two photos, or observations and priors do not determine the poses.
+    """
+    settings = settings or AdjustmentSettings()
+    problem = _Problem.prepare(block, observations, information, settings, start or block)
+    for k in range(settings.rounds):
+        problem.iterate()
+        problem.remove_gross_errors(is_last=k == settings.rounds - 1)
+        if on_round is not None:
+            on_round()
+    problem.iterate()
+    if problem.prior_chi2() <= _CONTRADICTION:
+        # Poses that contradict the photos bend them; what then correlates is not the photos' noise
+        problem.inflation = problem.correlation().design_effect
+        problem.iterate()
+    return problem.result()
+
+
+@dataclass
+class _Problem:
+    """Unknowns, observations and priors of a running adjustment."""
+
+    given: ImageBlock
+    block: ImageBlock
+    points: FloatArray
+    observations: Observations
+    origin: np.ndarray[Any, np.dtype[np.int64]]
+    prior: FloatArray
+    free: BoolArray
+    lens: FloatArray
+    boresight: FloatArray
+    settings: AdjustmentSettings
+    scale: float = 1.0
+    #: Observations per independent one: what the images weigh less against the priors.
+    inflation: float = 1.0
+    #: Standard deviation given for each kind of observation, pixels.
+    stated: dict[int, float] = field(default_factory=dict)
+    damping: float = 1e-8  # more would hold back the weakest modes, which decide heights; smoothed poses begin close
+
+    @classmethod
+    def prepare(
+        cls,
+        block: ImageBlock,
+        observations: Observations,
+        information: FloatArray,
+        settings: AdjustmentSettings,
+        start: ImageBlock,
+    ) -> _Problem:
+        begin = replace(start, intrinsics=block.intrinsics)
+        first = triangulate(begin, observations)
+        fixed = np.isfinite(first.points[:, 0])
+        kept, origin = observations.keep(fixed[observations.point], min_views=2)
+        if kept.n_points == 0:
+            msg = (
+                f"None of {observations.n_points} points is fixed by two of the {len(block)} photos. Check that poses "
+                "and photos belong together and that photos overlap."
+            )
+            raise InputDataError(msg)
+        n_flights = int(block.flight.max()) + 1
+        prior, free = _prior(block, information, settings, n_flights)
+        problem = cls(
+            given=block,
+            block=begin,
+            points=first.points[origin],
+            observations=kept,
+            origin=origin,
+            prior=prior,
+            free=free,
+            lens=np.zeros((len(block.intrinsics), N_CALIBRATION)),
+            boresight=np.zeros((n_flights, 3)),
+            settings=settings,
+        )
+        problem.scale = max(1.0, problem.robust_scale())
+        problem.stated = {int(kind): float(np.median(kept.sigma[kept.kind == kind])) for kind in np.unique(kept.kind)}
+        return problem
+
+    @property
+    def n_reduced(self) -> int:
+        """Unknowns of poses and lenses, without boresight."""
+        return 6 * len(self.block) + self.lens.size
+
+    def standardised(self) -> FloatArray:
+        """Length of each residual over its standard deviation; large for points behind a camera."""
+        error = residuals(self.block, self.points, self.observations)
+        length = np.sqrt(np.sum(error**2, axis=1) / 2) / self.observations.sigma
+        return np.asarray(np.nan_to_num(length, nan=1e6), dtype=np.float64)
+
+    def robust_scale(self) -> float:
+        """Median of the standardised residuals over that of normal errors (Rayleigh), degrees of freedom heeded."""
+        n, unknowns = 2 * len(self.observations), 3 * len(self.points) + 6 * len(self.block)
+        share = max((n - unknowns) / n, 0.05)
+        return float(np.median(self.standardised()) / (np.sqrt(np.log(2.0)) * np.sqrt(share)))
+
+    def correlation(self) -> PixelCorrelation:
+        """Correlation of residuals within photos."""
+        width, height = self.block.size.mean(axis=0)
+        error = residuals(self.block, self.points, self.observations)
+        return pixel_correlation(error, self.observations, float(np.hypot(width, height)))
+
+    def weights(self) -> FloatArray:
+        """Robust weights of the observations, each taken as independent."""
+        s = self.standardised() / (_CAUCHY * self.scale)
+        return np.asarray(1.0 / ((1.0 + s * s) * self.observations.sigma**2))
+
+    def deviation(self) -> FloatArray:
+        """Unknowns of the camera side minus what the priors expect, boresight last."""
+        turn = Rotation.from_matrix(self.block.rotation @ self.given.rotation.transpose(0, 2, 1)).as_rotvec()
+        pose = np.hstack([self.block.position - self.given.position, turn])
+        return np.concatenate([pose.ravel(), self.lens.ravel(), self.boresight.ravel()])
+
+    def prior_chi2(self) -> float:
+        """Squared deviation of the poses from navigation in units of its covariance, per pose parameter."""
+        e = self.deviation()
+        return float(e @ self.prior @ e) / (6 * len(self.block))
+
+    def cost(self) -> float:
+        s = self.standardised() / (_CAUCHY * self.scale)
+        e = self.deviation()
+        loss = (_CAUCHY * self.scale) ** 2 * float(np.log1p(s * s).sum())
+        return 2 * loss / self.inflation + float(e @ self.prior @ e)
+
+    def system(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Normal matrix, gradient and observation weights."""
+        weight = self.weights() / self.inflation
+        system: Any = reduced_system
+        matrix, gradient = system(*self.arrays(), weight, damping)
+        whole, total = self.prior.copy(), -(self.prior @ self.deviation())
+        whole[: self.n_reduced, : self.n_reduced] += matrix
+        total[: self.n_reduced] += gradient
+        return whole[np.ix_(self.free, self.free)], total[self.free], weight
+
+    def matrix(self, weight: FloatArray) -> FloatArray:
+        """Normal matrix with given observation weights."""
+        system: Any = reduced_system
+        whole = self.prior.copy()
+        whole[: self.n_reduced, : self.n_reduced] += system(*self.arrays(), weight, 0.0)[0]
+        return np.asarray(whole[np.ix_(self.free, self.free)])
+
+    def arrays(self) -> tuple[Any, ...]:
+        b, o = self.block, self.observations
+        return self.points, b.rotation, b.position, b.intrinsics, b.lens, o.start, o.image, o.pixel
+
+    def iterate(self) -> None:
+        """Levenberg-Marquardt until the cost stands still."""
+        steps: Any = point_steps
+        cost = self.cost()
+        for _ in range(_MAX_ITERATIONS):
+            matrix, gradient, weight = self.system(self.damping)
+            matrix[np.diag_indices_from(matrix)] *= 1.0 + self.damping
+            step = np.zeros(len(self.prior))
+            step[self.free] = cho_solve(_factor(matrix), gradient)
+            moved = steps(*self.arrays(), weight, self.damping, step[: self.n_reduced])
+            trial = self.moved(step, moved)
+            new = trial.cost()
+            if not new <= cost:
+                if new - cost < _CONVERGED * cost or self.damping >= 1e6:
+                    break
+                self.damping *= 10
+                continue
+            self.block, self.points, self.lens, self.boresight = trial.block, trial.points, trial.lens, trial.boresight
+            self.damping = max(self.damping / 10, 1e-12)
+            if cost - new < _CONVERGED * cost:
+                break
+            cost = new
+
+    def moved(self, step: FloatArray, point_step: FloatArray) -> _Problem:
+        n = len(self.block)
+        pose = step[: 6 * n].reshape(n, 6)
+        lens = self.lens + step[6 * n : self.n_reduced].reshape(self.lens.shape)
+        rotation = Rotation.from_rotvec(pose[:, 3:]).as_matrix() @ self.block.rotation
+        intrinsics = self.given.intrinsics.copy()
+        intrinsics[:, :2] *= np.exp(lens[:, :1])
+        intrinsics[:, 2:6] += lens[:, 1:]
+        block = replace(
+            self.block, rotation=rotation, position=self.block.position + pose[:, :3], intrinsics=intrinsics
+        )
+        boresight = self.boresight + step[self.n_reduced :].reshape(self.boresight.shape)
+        return replace(self, block=block, points=self.points + point_step, lens=lens, boresight=boresight)
+
+    def remove_gross_errors(self, *, is_last: bool) -> None:
+        """Drop observations far beyond the noise, re-estimate the noise of each kind."""
+        error = self.standardised()
+        self.scale = 1.0 if is_last else max(1.0, self.robust_scale())
+        factor = self.robust_scale()
+        limit = self.settings.max_error * max(factor, 0.1)
+        n_views = self.settings.min_views if is_last else 2
+        kept, stays = self.observations.keep(error < limit, min_views=n_views)
+        if kept.n_points == 0:
+            msg = (
+                "No point is left in agreement with the poses. Check that photos, camera file and logs belong together."
+            )
+            raise InputDataError(msg)
+        self.observations = self._with_noise(kept, stays)
+        self.points, self.origin = self.points[stays], self.origin[stays]
+        self.scale = 1.0
+
+    def _with_noise(self, kept: Observations, stays: Any) -> Observations:
+        """Standard deviation per kind of observation from its residuals."""
+        error = residuals(self.block, self.points[stays], kept)
+        share = 1.0 - 1.5 / kept.n_views[kept.point]  # three of 2 n coordinates go into the point
+        sigma = kept.sigma.copy()
+        for kind in np.unique(kept.kind):
+            mine = (kept.kind == kind) & np.isfinite(error[:, 0])
+            redundancy = float(share[mine].sum()) * 2 * max(1 - 3 * len(self.block) / max(len(kept), 1), 0.1)
+            square = float(np.sum(error[mine] ** 2))
+            if redundancy > 20 and square > 0:
+                most = _MAX_SIGMA_RATIO * self.stated[int(kind)]
+                sigma[kept.kind == kind] = np.clip(np.sqrt(square / redundancy), _MIN_SIGMA, most)
+        return replace(kept, sigma=sigma)
+
+    def result(self) -> Adjustment:
+        weight = self.weights()
+        matrix = self.matrix(weight / self.inflation)
+        deviation = self.deviation()
+        covariance = np.zeros((len(self.prior), len(self.prior)))
+        covariance[np.ix_(self.free, self.free)] = cho_solve(_factor(matrix), np.eye(len(matrix)))
+        std = np.sqrt(np.diag(covariance))
+        n = 6 * len(self.block)
+        return Adjustment(
+            block=self.block,
+            points=self.points,
+            observations=self.observations,
+            weight=weight,
+            origin=self.origin,
+            camera_covariance=covariance[: self.n_reduced, : self.n_reduced],
+            lens_correction=self.lens,
+            lens_std=std[n : self.n_reduced].reshape(self.lens.shape),
+            boresight=self.boresight,
+            boresight_std=std[self.n_reduced :].reshape(self.boresight.shape),
+            pose_correction=deviation[:n].reshape(-1, 6),
+            correlation=self.correlation(),
+            prior_chi2=self.prior_chi2(),
+        )
+
+
+def _prior(
+    block: ImageBlock, information: FloatArray, settings: AdjustmentSettings, n_flights: int
+) -> tuple[FloatArray, BoolArray]:
+    """Information of poses, lenses and boresight; which of them are adjusted."""
+    unknown = sorted(set(settings.lens) - set(LENS_PARAMETERS))
+    if unknown:
+        msg = f"Unknown lens parameters {unknown}. Choose of {', '.join(LENS_PARAMETERS)}."
+        raise ValueError(msg)
+    n = 6 * len(block)
+    if information.shape != (n, n):
+        msg = f"The information of {len(block)} poses has shape {information.shape}; expected {(n, n)}."
+        raise ValueError(msg)
+    n_lenses = len(block.intrinsics)
+    lens = np.tile(np.asarray(settings.lens_std) ** -2.0, n_lenses)
+    prior: FloatArray = block_diag(information, np.diag(lens), np.zeros((3 * n_flights, 3 * n_flights)))
+    free = np.ones(len(prior), dtype=bool)
+    free[n : n + lens.size] = np.tile([name in settings.lens for name in LENS_PARAMETERS], n_lenses)
+    if settings.boresight_std <= 0:
+        free[n + lens.size :] = False
+        return prior, free
+    pattern = np.zeros((n, 3 * n_flights))
+    for flight in range(n_flights):
+        rows = np.repeat(block.flight == flight, 6)
+        pattern[rows, 3 * flight : 3 * flight + 3] = boresight_pattern(block.rotation[block.flight == flight])
+    cross = information @ pattern
+    at = slice(n + lens.size, None)
+    prior[:n, at], prior[at, :n] = -cross, -cross.T
+    prior[at, at] = pattern.T @ cross + np.eye(3 * n_flights) / settings.boresight_std**2
+    return prior, free
+
+
+def _factor(matrix: FloatArray) -> Any:
+    try:
+        return cho_factor(matrix, check_finite=False)
+    except LinAlgError as error:
+        msg = (
+            "Observations and priors do not determine the poses. Give positive accuracies for positions and angles, "
+            f"or adjust fewer lens parameters. ({error})"
+        )
+        raise InputDataError(msg) from error

@@ -1,0 +1,130 @@
+"""The difference of two epochs of a programme with everything that is known about its errors."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from changedetect.differencing import (
+    ChangeMaps,
+    ChangeObjects,
+    CoherentTerm,
+    TooLittleGroundError,
+    difference_models,
+    find_objects_of_change,
+    summarise,
+)
+from changedetect.io.zones import covered_cells, read_zones
+from changedetect.pipeline.rasters import predict_layers, product_grid
+from changedetect.pipeline.regions import join_regions
+
+if TYPE_CHECKING:
+    from changedetect.catalogue import Programme
+    from changedetect.grid import Grid
+    from changedetect.models.base import SurfaceModel
+    from changedetect.pipeline.learn import ModelShelf
+    from changedetect.typing import BoolArray, JSONObject
+
+__all__ = ["PairDifference", "difference_pair"]
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PairDifference:
+    """
+    What two epochs of a programme differ by.
+
+    Attributes
+    ----------
+    grid : Grid
+    maps : ChangeMaps
+    objects : ChangeObjects
+        At a false discovery rate of one less the programme's confidence.
+    summary : dict
+        As `summarise` gives it.
+    """
+
+    grid: Grid
+    maps: ChangeMaps
+    objects: ChangeObjects
+    summary: JSONObject
+
+
+def difference_pair(programme: Programme, earlier: str, later: str, models: ModelShelf) -> PairDifference:
+    """
+    Difference two epochs.
+
+    Parameters
+    ----------
+    programme : Programme
+    earlier, later : str
+        Epoch ids, in the order of time.
+    models : ModelShelf
+
+    Returns
+    -------
+    difference : PairDifference
+
+    Notes
+    -----
+    The errors of the alignments of both epochs to the programme's first enter as coherent terms. Where the programme
+    names stable areas the correlated errors are estimated there, else on ground found not to have changed.
+    """
+    config = programme.config
+    first, second = models.get(earlier), models.get(later)
+    grid = product_grid(config, join_regions(first.region, second.region))
+    terms = _alignment_terms(programme, (earlier, later), first, grid)
+    try:
+        stable = _stable_cells(programme, grid)
+        maps = difference_models(first, second, grid, config.differencing, stable=stable, coherent=terms)
+    except TooLittleGroundError as error:
+        logger.warning("%s to %s: %s; unchanged ground is found instead", earlier, later, error)
+        maps = difference_models(first, second, grid, config.differencing, coherent=terms)
+    confidence = config.differencing.confidence
+    objects = find_objects_of_change(maps, grid.resolution, confidence, 1.0 - confidence)
+    return PairDifference(grid, maps, objects, summarise(maps, grid, objects, confidence))
+
+
+def _stable_cells(programme: Programme, grid: Grid) -> BoolArray | None:
+    """Cells in the programme's stable areas; None where it names none."""
+    areas = programme.stable_areas_path
+    if areas is None:
+        return None
+    stable = np.zeros(grid.shape, bool)
+    for zone in read_zones(areas, grid.crs):
+        covered = covered_cells(zone.polygon, grid)
+        if covered is not None:
+            window, inside = covered
+            stable[window] |= inside
+    return stable
+
+
+def _alignment_terms(
+    programme: Programme, epoch_ids: tuple[str, str], surface: SurfaceModel, grid: Grid
+) -> list[CoherentTerm]:
+    """Errors of the transforms that moved the epochs; ground that the earlier epoch did not see counts as level."""
+    applied = []
+    for epoch_id in epoch_ids:
+        found = programme.state_record(epoch_id)
+        record = None if found is None else found[0].alignment
+        alignment = None if record is None else record.applied()
+        if alignment is not None:
+            applied.append(alignment)
+    if not applied:
+        return []
+    elevation = predict_layers(surface, grid)["elevation"]
+    steep_north, steep_east = (
+        np.gradient(elevation, -grid.resolution, grid.resolution)
+        if min(grid.shape) > 1
+        else (np.zeros(grid.shape), np.zeros(grid.shape))
+    )
+    slope_east, slope_north = np.nan_to_num(steep_east).ravel(), np.nan_to_num(steep_north).ravel()
+    height = np.where(np.isfinite(elevation), elevation, np.nanmedian(elevation)).ravel()
+    easting, northing = grid.coordinates()
+    return [
+        CoherentTerm(a.offset_design(easting, northing, slope_east, slope_north, height), a.covariance) for a in applied
+    ]
