@@ -178,7 +178,7 @@ def test_a_step_of_the_vertical_datum_is_said_in_plain_words(tmp_path, caplog):
     words = (
         "epochs differ by a median of -0.41 m over 100 % of the area, as a vertical datum or registration step would"
     )
-    assert result.warnings == (f"{FIRST} to {SECOND}: {words}; no co-registration is applied",)
+    assert result.warnings == (f"{FIRST} to {SECOND}: {words}, and co-registration did not take it out",)
     assert words in caplog.text
     summary = read_json(programme.product_directory(f"{FIRST}_{SECOND}") / "summary.json")
     assert summary["warnings"][0].startswith(words)

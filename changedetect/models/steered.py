@@ -85,7 +85,7 @@ def level_lines(level: Level, kernel: float) -> FloatArray:
         smoothed: FloatArray = gaussian_filter(a, reach, order=order, truncate=2.5)
         return smoothed / spacing ** sum(order)
 
-    north, east = np.gradient(values, spacing)
+    north, east = (np.asarray(g, np.float64) for g in np.gradient(values, spacing))
     near = _DIRECTION_WINDOW
     angle = 0.5 * np.arctan2(2.0 * smooth(east * north, near), smooth(east * east - north * north, near))
     ex, ey = np.cos(angle), np.sin(angle)

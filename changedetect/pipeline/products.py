@@ -171,7 +171,7 @@ def offset_warning(summary: JSONObject) -> str | None:
     moved = summary["area_raised_m2" if offset > 0 else "area_lowered_m2"] / summary["area_observed_m2"]
     return (
         f"epochs differ by a median of {offset:+.2f} m over {100.0 * moved:.0f} % of the area, as a vertical datum or "
-        "registration step would; no co-registration is applied"
+        "registration step would, and co-registration did not take it out"
     )
 
 
