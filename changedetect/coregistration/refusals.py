@@ -47,6 +47,9 @@ _LEAST_STRENGTH = 4.0
 #: Residuals of stable ground scatter by at most so many times the noise of neighbours: 1.2 where errors are
 #: independent, 1.8 on an airborne lidar pair, 4 to 28 on a beach and a sandbar that changed all over.
 _LARGEST_SCATTER = 4.0
+#: The same where tilt, rotation or scale were taken: gentle change over most of a site looks like them, and taken out it
+#: would be lost (a beach of 14 months was tilted by 5 mm/m).
+_LARGEST_SCATTER_TILTED = 2.0
 #: Another unit must bring elevations this much closer to the reference to be named.
 _UNIT_GAIN = 0.05
 _SPREAD_GAIN = 0.7
@@ -210,10 +213,12 @@ def check_scatter(fit: Fit) -> None:
     local = nmad(residual - residual[nearest]) / math.sqrt(2.0)
     local = math.hypot(local, math.sqrt(float(np.median(fit.residuals.surface_variance[kept]))))
     scatter = nmad(residual)
-    if scatter > _LARGEST_SCATTER * max(local, 1e-3):
+    is_simple = fit.transform.kind in ("vertical", "shift")
+    limit = _LARGEST_SCATTER if is_simple else _LARGEST_SCATTER_TILTED
+    if scatter > limit * max(local, 1e-3):
         msg = (
             f"Change cannot be told from error: residuals scatter by {scatter:.2f} m on the ground that agrees best, "
-            f"where observations and reference are uncertain by {local:.2f} m ({_LARGEST_SCATTER:g} times as much are "
+            f"where observations and reference are uncertain by {local:.2f} m ({limit:g} times as much are "
             "allowed). Give stable areas, or demand a kind of transform if the ground is known to be stable."
         )
         raise AlignmentError(msg, "stable ground")
