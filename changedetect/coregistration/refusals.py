@@ -47,8 +47,8 @@ _LEAST_STRENGTH = 4.0
 #: Residuals of stable ground scatter by at most so many times the noise of neighbours: 1.2 where errors are
 #: independent, 1.8 on an airborne lidar pair, 4 to 28 on a beach and a sandbar that changed all over.
 _LARGEST_SCATTER = 4.0
-#: The same where tilt, rotation or scale were taken: gentle change over most of a site looks like them, and taken out it
-#: would be lost (a beach of 14 months was tilted by 5 mm/m).
+#: The same where tilt, rotation or scale were taken: gentle change over most of a site looks like them, and taken out
+#: it would be lost (a beach of 14 months was tilted by 5 mm/m).
 _LARGEST_SCATTER_TILTED = 2.0
 #: Another unit must bring elevations this much closer to the reference to be named.
 _UNIT_GAIN = 0.05
