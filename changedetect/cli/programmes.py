@@ -28,6 +28,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands to the application."""
     command(app, "init")(init)
     command(app, "add")(add)
+    command(app, "withdraw")(withdraw)
     command(app, "simulate")(simulate)
     config = typer.Typer(help="Settings of a programme.", no_args_is_help=True)
     command(config, "show", prefix="config ")(config_show)
@@ -166,6 +167,34 @@ def add(
     )
     late = "It lies before other epochs; update learns those again after it."
     return Outcome(document, [text, late] if added.is_late else [text])
+
+
+def withdraw(session: Session, *, directory: Directory, epoch_id: EpochId, dry_run: DryRun = False) -> Outcome:
+    """
+    Take a survey out; the next update makes everything as if it had never come.
+
+    For example:
+
+    changedetect withdraw site 2024-09-03
+    """
+    from changedetect.pipeline.withdraw import withdraw_epoch
+
+    plan = withdraw_epoch(session.open(directory), epoch_id, dry_run=dry_run)
+    kept_as = str(plan.kept_as.relative_to(directory))
+    document = {
+        "directory": str(directory),
+        "dry_run": dry_run,
+        "epoch_id": epoch_id,
+        "kept_as": kept_as,
+        "removed": [str(folder.relative_to(directory)) for folder in plan.removed],
+        "n_to_learn": plan.n_to_learn,
+    }
+    done = "Would withdraw" if dry_run else "Withdrew"
+    text = (
+        f"{done} epoch {epoch_id}; its file is kept as {kept_as}, its sources stay where they are. "
+        f"Next: changedetect update {directory}"
+    )
+    return Outcome(document, [text])
 
 
 def simulate(
