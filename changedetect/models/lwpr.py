@@ -367,6 +367,25 @@ class LWPRSurface:
         from place to place: where quiet and noisy ground meet, weighted planes would follow the quiet side only.
         """
         cells = self.evidence_.cells(self.survey_time_)
+        factor = self._noise_factor(cells)
+        observed = factor * cells.moments[:, 0] / cells.moments[:, 1]
+        return cells.with_noise(observed).with_weights_scaled(1.0 / float(np.median(factor)))
+
+    def stated_sigma_ratio(self) -> float | None:
+        """
+        Noise found in the present epoch over the standard deviations that its observations came with.
+
+        Returns
+        -------
+        ratio : float or None
+            Median; 2 says that the true noise is twice the stated one. None where none was stated.
+        """
+        if not self.evidence_.is_weighted:
+            return None
+        return math.sqrt(float(np.median(self._noise_factor(self.evidence_.cells(self.survey_time_)))))
+
+    def _noise_factor(self, cells: Cells) -> FloatArray:
+        """Variance of an observation of unit weight around every cell."""
         sizes = CellPyramid(cells)
         kernel = self.own_kernel_
         noise = [
@@ -374,9 +393,8 @@ class LWPRSurface:
             for size in (kernel, math.sqrt(2.0) * kernel)
         ]
         bend = np.maximum(noise[1] - noise[0], 0.0) / (_BEND_GROWTH - 1.0)
-        factor = np.maximum(noise[0] - bend, 0.25 * noise[0])
-        observed = factor * cells.moments[:, 0] / cells.moments[:, 1]
-        return cells.with_noise(observed).with_weights_scaled(1.0 / float(np.median(factor)))
+        factor: FloatArray = np.maximum(noise[0] - bend, 0.25 * noise[0])
+        return factor
 
     def _inherit(self, parent: Self | None) -> None:
         """Take over the memory and the kernel bank of the epoch before."""

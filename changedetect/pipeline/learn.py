@@ -122,10 +122,14 @@ def learn_epoch(
     learned = learned or _learn_points(programme, epoch, parent, reference_id, models)
     _write_state(programme, epoch, parent, learned)
     models.put(epoch.epoch_id, learned.model)
+    ratio = learned.model.stated_sigma_ratio() if isinstance(learned.model, LWPRSurface) else None
+    if ratio is not None:
+        logger.info("%s: the noise found is %.2f times the stated sigma.", epoch.epoch_id, ratio)
     return {
         "parent": parent.epoch_id if parent else None,
         "n_points": learned.n_points,
         "origin": learned.origin,
+        "sigma_ratio": ratio,
         "alignment": None if learned.alignment is None else asdict(learned.alignment),
         "warnings": [] if learned.alignment is None else list(learned.alignment.warnings),
         "sources": [{"uri": item.uri, "sha256": item.sha256, "n_used": item.n_used} for item in learned.sources],

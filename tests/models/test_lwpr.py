@@ -218,3 +218,13 @@ def test_density_is_found_also_when_only_part_of_the_extent_is_covered(density):
     easting = np.r_[rng.uniform(0.0, 20.0, n), 2000.0]
     northing = np.r_[rng.uniform(0.0, 20.0, n), 2000.0]
     np.testing.assert_allclose(point_density(easting, northing), density, rtol=0.6, atol=0.0)
+
+
+@pytest.mark.parametrize("stated", [0.025, 0.05, 0.2])
+def test_the_noise_found_is_compared_with_the_sigma_stated(stated):
+    rng = np.random.default_rng(31)
+    x, y = rng.uniform(0.0, 40.0, (2, 12_000))
+    z = 0.1 * x + np.sin(y / 9.0) + rng.normal(0.0, 0.05, x.size)
+    model = LWPRSurface().fit((x, y), z, np.full(x.size, stated))
+    np.testing.assert_allclose(model.stated_sigma_ratio(), 0.05 / stated, rtol=0.05, atol=0.0)
+    assert LWPRSurface().fit((x, y), z).stated_sigma_ratio() is None
