@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -111,7 +113,7 @@ def align(
         check_scatter(choice.fit)
     alignment = _reported(choice, sample, before.residual, len(cloud), overlap)
     remarks = _remarks(choice, alignment, sample, None if area is None else area_names)
-    object.__setattr__(alignment, "remarks", remarks)
+    alignment = replace(alignment, remarks=remarks)
     logger.info("%s: %s", alignment.transform.kind, alignment.wording())
     return alignment
 

@@ -209,6 +209,11 @@ class PairProducts:
     local: FloatArray
     correlated: FloatArray
 
+    @property
+    def strength(self) -> float:
+        """Mean of `correlated`; 1 where there is no pair, as on small rasters with scattered ground."""
+        return float(np.mean(self.correlated)) if self.correlated.size else 1.0
+
 
 def collect_pairs(
     score: FloatArray,
@@ -289,8 +294,7 @@ def fit_correlation(
     n = max(1, math.floor(math.log(max(longest / shortest, 1.0)) / math.log(_RANGE_RATIO) + 1e-9) + 1)
     ranges = shortest * _RANGE_RATIO ** np.arange(n)
     gaussians = np.exp(-0.5 * (pairs.distance[:, None] / ranges) ** 2)
-    strength = float(np.mean(pairs.correlated)) if pairs.distance.size else 1.0
-    design = np.vstack([gaussians * pairs.correlated[:, None], np.full((1, n), _WEIGHT_AT_ZERO * strength)])
+    design = np.vstack([gaussians * pairs.correlated[:, None], np.full((1, n), _WEIGHT_AT_ZERO * pairs.strength)])
     wanted = np.append(pairs.product - pairs.local * local(pairs.distance), _WEIGHT_AT_ZERO * excess)
     shares, _ = nnls(design, wanted)
     kept = shares > _NEGLIGIBLE * max(float(shares.sum()), 1e-12)

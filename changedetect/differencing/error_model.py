@@ -208,10 +208,8 @@ def _estimate_round(
     pairs = collect_pairs(score, parts, usable, resolution, rng)
     excess = float(np.mean(score[usable] ** 2) - np.mean(parts[0][usable] ** 2)) / float(np.mean(parts[1][usable] ** 2))
     extent = resolution * min(difference.shape)
-    # a small raster with scattered ground may hold no pair of cells at any lag: then all is of the shortest range
-    strength = float(np.mean(pairs.correlated)) if pairs.distance.size else 1.0
     correlation = fit_correlation(
-        pairs, before.local, max(excess, 0.0) * strength, before.local.ranges[0], _LONGEST_RANGE * extent
+        pairs, before.local, max(excess, 0.0) * pairs.strength, before.local.ranges[0], _LONGEST_RANGE * extent
     )
     return replace(before, scale=scale, correlation=correlation, n_independent=n_independent)
 

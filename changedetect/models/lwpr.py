@@ -48,6 +48,14 @@ _BEND_GROWTH = 3.0
 
 
 @dataclass(frozen=True)
+class _Own:
+    """Cells of the present epoch with the noise found, and the typical noise variance of unit weight."""
+
+    cells: Cells
+    noise_factor: float
+
+
+@dataclass(frozen=True)
 class _Built:
     """Receptive fields and what they were computed from."""
 
@@ -183,7 +191,7 @@ class LWPRSurface:
         survey_time: float | None = None,
     ) -> Self:
         """Forget everything, then learn; see `partial_fit`."""
-        for name in [key for key in self.__dict__ if key.endswith("_") or key == "_built"]:
+        for name in [key for key in self.__dict__ if key.endswith("_") or key in {"_built", "_own"}]:
             del self.__dict__[name]
         return self.partial_fit(coordinates, elevation, sigma, survey_time)
 
@@ -264,6 +272,7 @@ class LWPRSurface:
             raise ValueError(msg)
         self.evidence_.add((easting, northing), z, s)
         self.__dict__.pop("_built", None)
+        self.__dict__.pop("_own", None)
         return self
 
     def predict(self, coordinates: Coordinates) -> Prediction:
@@ -366,10 +375,7 @@ class LWPRSurface:
         Weights are scaled, all by one factor, to one over the typical noise variance. They do not follow the noise
         from place to place: where quiet and noisy ground meet, weighted planes would follow the quiet side only.
         """
-        cells = self.evidence_.cells(self.survey_time_)
-        factor = self._noise_factor(cells)
-        observed = factor * cells.moments[:, 0] / cells.moments[:, 1]
-        return cells.with_noise(observed).with_weights_scaled(1.0 / float(np.median(factor)))
+        return self._own_noise().cells
 
     def stated_sigma_ratio(self) -> float | None:
         """
@@ -382,10 +388,18 @@ class LWPRSurface:
         """
         if not self.evidence_.is_weighted:
             return None
-        return math.sqrt(float(np.median(self._noise_factor(self.evidence_.cells(self.survey_time_)))))
+        return math.sqrt(self._own_noise().noise_factor)
 
-    def _noise_factor(self, cells: Cells) -> FloatArray:
-        """Variance of an observation of unit weight around every cell."""
+    def _own_noise(self) -> _Own:
+        """Noise of the present epoch, found when first asked for: every map and every difference needs it."""
+        own = self.__dict__.get("_own")
+        if own is None:
+            own = self._find_noise()
+            self._own = own
+        return own
+
+    def _find_noise(self) -> _Own:
+        cells = self.evidence_.cells(self.survey_time_)
         sizes = CellPyramid(cells)
         kernel = self.own_kernel_
         noise = [
@@ -393,8 +407,10 @@ class LWPRSurface:
             for size in (kernel, math.sqrt(2.0) * kernel)
         ]
         bend = np.maximum(noise[1] - noise[0], 0.0) / (_BEND_GROWTH - 1.0)
-        factor: FloatArray = np.maximum(noise[0] - bend, 0.25 * noise[0])
-        return factor
+        factor = np.maximum(noise[0] - bend, 0.25 * noise[0])
+        typical = float(np.median(factor))
+        observed = factor * cells.moments[:, 0] / cells.moments[:, 1]
+        return _Own(cells.with_noise(observed).with_weights_scaled(1.0 / typical), typical)
 
     def _inherit(self, parent: Self | None) -> None:
         """Take over the memory and the kernel bank of the epoch before."""

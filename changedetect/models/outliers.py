@@ -103,9 +103,8 @@ def _common_distance(squares: _Squares, distance: FloatArray) -> FloatArray:
     return found
 
 
-def _isolation(squares: _Squares, coordinates: Coordinates, elevation: FloatArray) -> FloatArray:
+def _isolation(squares: _Squares, wide: _Squares, coordinates: Coordinates, elevation: FloatArray) -> FloatArray:
     """Vertical distance of every observation to its third nearest in height, shape (n,); infinite if there is none."""
-    wide = squares.wider(2)
     slopes = _slopes(squares, wide, wide.medians(elevation))
     distance = np.empty(elevation.size)
     asked = np.ones(elevation.size, np.bool_)
@@ -199,11 +198,12 @@ def gross_errors(
     squares = _Squares.of(row, column, side)
     if is_dense:
         return _stands_far_off(squares, coordinates, elevation, limit)
-    heights = _isolation(squares, coordinates, elevation)
+    wide = squares.wider(2)
+    heights = _isolation(squares, wide, coordinates, elevation)
     kept = ~_stands_alone(squares, heights, limit)
     if np.count_nonzero(kept) <= _FEW:
         return alone
     surface = _plain_surface(coordinates, elevation, kept, _SURFACE_KERNEL / math.sqrt(density))
-    left_over = _isolation(squares, coordinates, elevation - surface)
+    left_over = _isolation(squares, wide, coordinates, elevation - surface)
     # beside an edge the plain surface misses all observations, each by another amount: there the heights speak
     return _stands_alone(squares, np.minimum(heights, left_over), limit)
