@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
