@@ -67,7 +67,7 @@ class AdaptiveConfig:
     lattice_spacing: Annotated[float, Field(gt=0, le=2)] = 0.8
     shrinkage: Annotated[float, Field(ge=0)] = 1.0
     prior_observations: Annotated[float, Field(gt=0)] = 1.0
-    outlier_limit: Annotated[float, Field(ge=0)] = 8.0
+    outlier_limit: Annotated[float, Field(ge=0)] = 11.0
 
     def __post_init__(self) -> None:
         """Refuse an empty range of kernels."""

@@ -28,8 +28,8 @@ __all__ = ["N_GEOMETRY", "N_STEERED", "fit_steered_planes"]
 #: 2 curvature of the level line in 1/m, 3 whether the field is steered (1 or 0).
 N_GEOMETRY = 4
 #: Columns of the answer: 0 value, 1 slope east, 2 slope north, 3 noise variance of the value, 4 effective number of
-#: observations, 5 residual variance.
-N_STEERED = 6
+#: observations, 5 mean square of the leave-one-out errors, 6 that of the rival.
+N_STEERED = 7
 #: Ridge on slopes, in observations: keeps the plane of collinear cells defined.
 _RIDGE = 1e-2
 
@@ -46,6 +46,7 @@ def fit_steered_planes(
     first_row: int,
     first_column: int,
     geometry: FloatArray,
+    rival: FloatArray,
     fits: FloatArray,
 ) -> None:
     """
@@ -65,6 +66,8 @@ def fit_steered_planes(
     first_row, first_column : int
         Lattice indices of fits[0, 0].
     geometry : array, shape (n_i, n_j, N_GEOMETRY)
+    rival : array, shape (n_rows, n_columns), m2
+        Squared leave-one-out error, at every cell of the window, of the surface that these fields compete with.
     fits : array, shape (n_i, n_j, N_STEERED)
         Filled in place; zero where a field is not steered or has no cell at all.
 
@@ -72,7 +75,9 @@ def fit_steered_planes(
     -----
     With x the offset from the centre, e the unit vector across and t the one along the level line of curvature k,
     the field's coordinates are v = t'x and u = e'x + k v**2 / 2: u is constant along the line. Activation and plane
-    are those of `fit_planes` in (u / across, v / along). Within a cell, u and v vary as their tangent.
+    are those of `fit_planes` in (u / across, v / along). Within a cell, u and v vary as their tangent. With r the
+    residual of a cell's mean and h its leverage w n x'A^-1 x, its leave-one-out error is r / (1 - h). Squared errors
+    are averaged with weights w**2 n, which speak for the centre.
     """
     radius = 2.0 * along
     for i in prange(fits.shape[0]):
@@ -171,13 +176,37 @@ def fit_steered_planes(
             g00 = i00 * t0 + i01 * t1 + i02 * t2
             g01 = i00 * t1 + i01 * t3 + i02 * t4
             g02 = i00 * t2 + i01 * t4 + i02 * t5
-            g11 = i01 * t1 + i11 * t3 + i12 * t4
-            g22 = i02 * t2 + i12 * t4 + i22 * t5
             o[0] = b0
             o[1] = b1 * ex / across - b2 * ey / along
             o[2] = b1 * ey / across + b2 * ex / along
             o[3] = max(g00 * i00 + g01 * i01 + g02 * i02, 1e-3 * t0 / (s0 * s0))
             o[4] = n_effective
-            residual = max(zz - b0 * z0 - b1 * z1 - b2 * z2, 0.0)
-            freedom = expected - (g00 + g11 + g22)
-            o[5] = residual / max(freedom * s0 / count, 0.3 * s0)
+            # leave-one-out errors of this field and of its rival, over the same cells with the same weights
+            own = other = weight = 0.0
+            for a in range(a_low, a_high + 1):
+                for b in range(b_low, b_high + 1):
+                    m = window[a, b]
+                    n = m[1]
+                    if n <= 0.0:
+                        continue
+                    dx = (column0 + b + 0.5) * cell_size - x0 + m[2] / n
+                    dy = (row0 + a + 0.5) * cell_size - y0 + m[3] / n
+                    v = ex * dy - ey * dx
+                    if v > radius or v < -radius:
+                        continue
+                    u = ex * dx + ey * dy + 0.5 * bend * v * v
+                    u /= across
+                    v /= along
+                    q = u * u + v * v
+                    if q >= 4.0:
+                        continue
+                    w = 1.0 - 0.25 * q
+                    w *= w
+                    h = w * n * (i00 + 2.0 * (i01 * u + i02 * v) + i11 * u * u + 2.0 * i12 * u * v + i22 * v * v)
+                    e = (m[7] / n - b0 - b1 * u - b2 * v) / max(1.0 - h, 0.1)
+                    w *= w * n
+                    own += w * e * e
+                    other += w * rival[a, b]
+                    weight += w
+            o[5] = own / weight
+            o[6] = other / weight

@@ -20,6 +20,7 @@ from changedetect.models.cells import Cells, Evidence, merge_cells
 from changedetect.models.lwpr_state import read_state, write_state
 from changedetect.models.outliers import gross_errors
 from changedetect.models.pyramid import SUPPORT_KERNELS, CellPyramid, Level, noise_variance, refine, scale_bank, support
+from changedetect.models.rough_ground import refine_by_processes
 from changedetect.models.steered import steer
 
 if TYPE_CHECKING:
@@ -446,7 +447,12 @@ class LWPRSurface:
 
     def _refine(self, cells: Cells, kernel: float) -> Level:
         """Surface of cells whose density supports a kernel."""
-        level, unresolved = refine(cells, self.kernels_, self.settings.lattice_spacing, self.settings.shrinkage)
+        how = self.kernels_, self.settings.lattice_spacing, self.settings.shrinkage
+        if cells.cell_size <= 0.5 * kernel:
+            level, left_out = refine_by_processes(cells, *how)
+            return steer(cells, level, kernel, left_out)
+        # observations are dense against the kernel wanted: it averages many of them, and fields will do
+        level, unresolved = refine(cells, *how)
         level = steer(cells, level, kernel)
         level.planes[3] += unresolved
         return level

@@ -3,8 +3,8 @@ Receptive fields along edges: their metric follows the level lines of the surfac
 
 Round fields of one size cannot resolve the rim of a crown or a scarp and average its noise at once. Along such a line
 the ground hardly varies: a field that is long along it, narrow across, and bent as it bends has as many observations
-and a third of the blur. Whether the ground asks for it is measured, not assumed: long and round fields of equal area
-compete by their residuals, and what wins replaces the surface found so far only as far as the difference of the two
+and a third of the blur. Whether the ground asks for it is measured, not assumed: long fields and the surface found so
+far compete by their leave-one-out errors, and what wins replaces that surface only as far as the difference of the two
 exceeds noise.
 """
 
@@ -34,13 +34,13 @@ _DIRECTION_WINDOW = 1.13
 _CURVATURE_WINDOW = 2.0
 #: Largest curvature of a level line, times the kernel along it: the parabola of the field stands for an arc.
 _CURVATURE_LIMIT = 0.5
-#: Roughness, in variances of the surface, from which a field may be steered. The blur of a round field is about a
-#: quarter of the roughness (both as standard deviations), so below this it is a third of the noise.
-_ROUGHNESS = 2.0
-#: Residual variance of long fields against that of round ones below which they are taken.
+#: Roughness, in variances of the surface, from which a field may be steered.
+_ROUGHNESS = 1.0
+#: Mean square of the leave-one-out errors of long fields against that of round ones below which they are taken; against
+#: other surfaces any advantage counts.
 _ADVANTAGE = 0.9
-#: Standard deviation, in lattice steps, of the window over which fields are compared.
-_COMPARE_REACH = 1.5
+#: Standard deviation, in lattice steps, of the window over which they are compared.
+_COMPARE_REACH = 1.0
 #: A squared difference counts at most this many noise variances in the comparison with noise.
 _RATIO_LIMIT = 100.0
 
@@ -110,15 +110,21 @@ def level_lines(level: Level, kernel: float) -> FloatArray:
     return geometry
 
 
-def _fit(cells: Cells, lattice: Lattice, geometry: FloatArray, kernel: float, elongation: float) -> FloatArray:
+def _fit(
+    cells: Cells, lattice: Lattice, geometry: FloatArray, kernel: float, elongation: float, left_out: FloatArray
+) -> FloatArray:
     """Planes of the steered fields of a lattice, each of the area of a round field of this kernel."""
     along, across = kernel * math.sqrt(elongation), kernel / math.sqrt(elongation)
     fits = np.zeros((*lattice.shape, N_STEERED))
     for part, window, row, column in windows(cells, lattice, 2.0 * along):
+        rival = np.zeros(window.shape[:2])
+        a, b = cells.row - row, cells.column - column
+        inside = (a >= 0) & (a < rival.shape[0]) & (b >= 0) & (b < rival.shape[1])
+        rival[a[inside], b[inside]] = left_out[inside]
         fit_steered_planes(
             window, cells.cell_size, row, column, along, across, lattice.spacing,
             lattice.first_row + part[0].start, lattice.first_column + part[1].start,
-            np.ascontiguousarray(geometry[part]), fits[part],
+            np.ascontiguousarray(geometry[part]), rival, fits[part],
         )  # fmt: skip
     return fits
 
@@ -135,7 +141,7 @@ def _pooled(values: FloatArray, among: BoolArray) -> FloatArray:
     return np.where(among, pooled, np.inf)
 
 
-def steer(cells: Cells, level: Level, kernel: float) -> Level:
+def steer(cells: Cells, level: Level, kernel: float, left_out: FloatArray | None = None) -> Level:
     """
     Replace fields at edges by fields along them.
 
@@ -147,6 +153,9 @@ def steer(cells: Cells, level: Level, kernel: float) -> Level:
         The surface found so far.
     kernel : float, m
         Kernel size that the density of observations supports; a steered field has the area of such a field.
+    left_out : array, shape (m,), m2, optional
+        Squared error of the surface found so far at every cell when that cell is left out. Without it, round fields of
+        the same area stand for that surface.
 
     Returns
     -------
@@ -155,7 +164,8 @@ def steer(cells: Cells, level: Level, kernel: float) -> Level:
 
     Notes
     -----
-    Long fields are taken where their residual variance, pooled over the neighbourhood, is below that of round ones.
+    Long fields are taken where their leave-one-out error, pooled over the neighbourhood, is below the other's at the
+    same cells: as in the paper's eqs 5 and 6, the metric of a field follows that error.
     With d the difference to the surface found so far and C the noise variance of the steered value, the surface moves
     by s d, s = max(0, 1 - 1 / mean(d**2 / C)): empirical Bayes as for the levels of the pyramid.
     """
@@ -163,10 +173,15 @@ def steer(cells: Cells, level: Level, kernel: float) -> Level:
     if not (geometry[..., 3] > 0.0).any():
         return level
     cells, height = cells.centred()
-    fits = _fit(cells, level.lattice, geometry, kernel, _ELONGATION)
-    round_fits = _fit(cells, level.lattice, geometry, kernel, 1.0)
-    is_long, is_round = fits[..., 4] >= N_MINIMUM, round_fits[..., 4] >= N_MINIMUM
-    taken = is_long & (_pooled(fits[..., 5], is_long) < _ADVANTAGE * _pooled(round_fits[..., 5], is_round))
+    rival = np.zeros(len(cells)) if left_out is None else left_out
+    fits = _fit(cells, level.lattice, geometry, kernel, _ELONGATION, rival)
+    is_long = fits[..., 4] >= N_MINIMUM
+    if left_out is None:
+        round_fits = _fit(cells, level.lattice, geometry, kernel, 1.0, rival)
+        limit = _ADVANTAGE * _pooled(round_fits[..., 5], round_fits[..., 4] >= N_MINIMUM)
+    else:
+        limit = _pooled(fits[..., 6], is_long)
+    taken = is_long & (_pooled(fits[..., 5], is_long) < limit)
     planes = level.planes.copy()
     noise = np.where(taken, fits[..., 3], 1.0)
     difference = fits[..., 0] + height - planes[0]

@@ -5,6 +5,7 @@ import pytest
 
 from changedetect.models.lwpr import LWPRSurface
 from changedetect.models.pyramid import Lattice, Level
+from changedetect.models.rough_ground import refine_by_processes
 from changedetect.models.steered import level_lines, steer
 
 SIDE = 40.0
@@ -22,9 +23,8 @@ def observations(ground, n, noise, seed):
 
 
 def unsteered(model):
-    from changedetect.models.pyramid import refine
-
-    return refine(model.own_cells(), model.kernels_, model.settings.lattice_spacing, model.settings.shrinkage)[0]
+    settings = model.settings
+    return refine_by_processes(model.own_cells(), model.kernels_, settings.lattice_spacing, settings.shrinkage)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -34,17 +34,17 @@ def test_the_rim_of_a_crown_comes_out_sharper(seed):
     u = np.linspace(2.0, SIDE - 2.0, 200)
     at = tuple(a.ravel() for a in np.meshgrid(u, u))
     rim = np.abs(np.hypot(at[0] - 20.0, at[1] - 20.0) - 8.0) < 0.5
-    plain = unsteered(model).blend(*at)[:, 0] - crown(*at)
+    plain = unsteered(model)[0].blend(*at)[:, 0] - crown(*at)
     steered = model.predict(at).elevation - crown(*at)
     assert np.sqrt(np.mean(steered[rim] ** 2)) < 0.85 * np.sqrt(np.mean(plain[rim] ** 2))
-    assert np.sqrt(np.mean(steered[~rim] ** 2)) < 1.05 * np.sqrt(np.mean(plain[~rim] ** 2))
+    assert np.sqrt(np.mean(steered[~rim] ** 2)) < np.sqrt(np.mean(plain[~rim] ** 2))
 
 
 def test_flat_ground_is_left_as_it_was():
     x, y, z = observations(lambda x, _: 0.2 * x, 6_000, 0.1, 3)
     model = LWPRSurface().fit((x, y), z)
-    before = unsteered(model)
-    after = steer(model.own_cells(), before, model.own_kernel_)
+    before, left_out = unsteered(model)
+    after = steer(model.own_cells(), before, model.own_kernel_, left_out)
     moved = np.abs(after.planes[0] - before.planes[0])[before.planes[4] > 0.0]
     assert np.sqrt(np.mean(moved**2)) < 0.2 * np.sqrt(np.median(before.planes[3]))
 
