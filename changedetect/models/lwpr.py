@@ -378,6 +378,23 @@ class LWPRSurface:
         """
         return self._own_noise().cells
 
+    def chosen_settings(self) -> dict[str, float]:
+        """
+        Return what was chosen from the density of the present epoch.
+
+        Returns
+        -------
+        chosen : dict
+            Side of a micro-cell, the kernel that this epoch's density supports, finest and coarsest kernel of the
+            pyramid, all in m.
+        """
+        return {
+            "cell_size_m": self.evidence_.cell_size,
+            "epoch_kernel_m": self.own_kernel_,
+            "kernel_min_m": self.kernels_[-1],
+            "kernel_max_m": self.kernels_[0],
+        }
+
     def stated_sigma_ratio(self) -> float | None:
         """
         Noise found in the present epoch over the standard deviations that its observations came with.

@@ -50,7 +50,7 @@ _RATIO_LIMIT = 100.0
 #: Detail of a level against that of the next coarser one, at most: 2**(-H) is 0.7 for ground as rough as a random walk.
 _LARGEST_DETAIL_RATIO = 0.8
 #: Largest cells, in kernels, from which a field is computed: the plane inside a cell is exact, its activation is not.
-_CELL_LIMIT = 0.55
+_CELL_LIMIT = 0.7
 #: Receptive fields along one edge of a block of work; bounds memory and changes no result.
 _BLOCK_FIELDS = 512
 

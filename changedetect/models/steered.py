@@ -34,8 +34,9 @@ _DIRECTION_WINDOW = 1.13
 _CURVATURE_WINDOW = 2.0
 #: Largest curvature of a level line, times the kernel along it: the parabola of the field stands for an arc.
 _CURVATURE_LIMIT = 0.5
-#: Roughness, in variances of the surface, from which a field may be steered.
-_ROUGHNESS = 1.0
+#: Roughness, in variances of the surface, from which a field may be steered: of one of local processes, of a pyramid,
+#: whose blur is not in its variance.
+_ROUGHNESS, _ROUGHNESS_OF_PYRAMID = 1.0, 2.0
 #: Mean square of the leave-one-out errors of long fields against that of round ones below which they are taken; against
 #: other surfaces any advantage counts.
 _ADVANTAGE = 0.9
@@ -56,7 +57,7 @@ def _filled(level: Level) -> FloatArray:
     return centred
 
 
-def level_lines(level: Level, kernel: float) -> FloatArray:
+def level_lines(level: Level, kernel: float, roughness_limit: float = _ROUGHNESS) -> FloatArray:
     """
     Direction and curvature of the surface's level lines, and where the surface is rougher than its own error.
 
@@ -66,6 +67,8 @@ def level_lines(level: Level, kernel: float) -> FloatArray:
         A finished surface, defined at one field at least.
     kernel : float, m
         Kernel size that the density of observations supports.
+    roughness_limit : float
+        In variances of the surface.
 
     Returns
     -------
@@ -106,7 +109,7 @@ def level_lines(level: Level, kernel: float) -> FloatArray:
     geometry = np.empty((*level.lattice.shape, N_GEOMETRY))
     geometry[..., 0], geometry[..., 1] = ex, ey
     geometry[..., 2] = np.clip(curvature, -limit, limit)
-    geometry[..., 3] = (level.planes[4] > 0.0) & (roughness > _ROUGHNESS * level.planes[3])
+    geometry[..., 3] = (level.planes[4] > 0.0) & (roughness > roughness_limit * level.planes[3])
     return geometry
 
 
@@ -169,7 +172,7 @@ def steer(cells: Cells, level: Level, kernel: float, left_out: FloatArray | None
     With d the difference to the surface found so far and C the noise variance of the steered value, the surface moves
     by s d, s = max(0, 1 - 1 / mean(d**2 / C)): empirical Bayes as for the levels of the pyramid.
     """
-    geometry = level_lines(level, kernel)
+    geometry = level_lines(level, kernel, _ROUGHNESS_OF_PYRAMID if left_out is None else _ROUGHNESS)
     if not (geometry[..., 3] > 0.0).any():
         return level
     cells, height = cells.centred()

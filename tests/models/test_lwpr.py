@@ -228,3 +228,13 @@ def test_the_noise_found_is_compared_with_the_sigma_stated(stated):
     model = LWPRSurface().fit((x, y), z, np.full(x.size, stated))
     np.testing.assert_allclose(model.stated_sigma_ratio(), 0.05 / stated, rtol=0.05, atol=0.0)
     assert LWPRSurface().fit((x, y), z).stated_sigma_ratio() is None
+
+
+def test_chosen_settings_follow_the_density_and_what_is_set_stays():
+    coordinates, elevation = survey()
+    chosen = LWPRSurface().fit(coordinates, elevation).chosen_settings()
+    thinned = tuple(c[::16] for c in coordinates)
+    assert LWPRSurface().fit(thinned, elevation[::16]).chosen_settings()["epoch_kernel_m"] > 3.0 * chosen["epoch_kernel_m"]
+    by_hand = LWPRSurface(AdaptiveConfig(kernel_min_m=2.0, kernel_max_m=30.0)).fit(coordinates, elevation)
+    assert by_hand.chosen_settings()["epoch_kernel_m"] == 2.0
+    assert by_hand.chosen_settings()["kernel_max_m"] >= 30.0
