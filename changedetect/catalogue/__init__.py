@@ -5,6 +5,8 @@ A programme is a folder::
 
     programme.toml          settings
     epochs/EPOCH_ID.toml    one survey epoch: date and sources
+    flights/EPOCH_ID/points/ points made from an epoch's flight, and manifest.json
+    flights/EPOCH_ID/steps/  what led to them, kept so that a stopped run goes on
     state/EPOCH_ID/         the model learned up to that epoch, and manifest.json
     products/EPOCH_ID/      rasters of one epoch, and manifest.json
     products/EARLIER_LATER/ rasters of one difference, and manifest.json
@@ -15,11 +17,14 @@ A programme is a folder::
 from __future__ import annotations
 
 from changedetect.catalogue.epoch import Epoch, Source, parse_date, survey_time_days, validate_epoch_id
-from changedetect.catalogue.programme import ChangeProduct, Programme
+from changedetect.catalogue.programme import POINTS_FOLDER, STEPS_FOLDER, ChangeProduct, Programme
 from changedetect.catalogue.records import (
     MANIFEST_FILE,
     AlignmentRecord,
+    AnchorRecord,
+    CommonErrorRecord,
     ProductRecord,
+    ReconstructionRecord,
     SourceRecord,
     StateRecord,
     damaged_files,
@@ -27,25 +32,33 @@ from changedetect.catalogue.records import (
 )
 from changedetect.catalogue.staleness import (
     Item,
+    anchors_of,
     epoch_product_reasons,
     own_state_reasons,
     pair_reasons,
     plan,
+    reconstruction_reasons,
     state_reasons,
     wanted_pairs,
 )
 
 __all__ = [
     "MANIFEST_FILE",
+    "POINTS_FOLDER",
+    "STEPS_FOLDER",
     "AlignmentRecord",
+    "AnchorRecord",
     "ChangeProduct",
+    "CommonErrorRecord",
     "Epoch",
     "Item",
     "ProductRecord",
     "Programme",
+    "ReconstructionRecord",
     "Source",
     "SourceRecord",
     "StateRecord",
+    "anchors_of",
     "damaged_files",
     "describe_files",
     "epoch_product_reasons",
@@ -53,6 +66,7 @@ __all__ = [
     "pair_reasons",
     "parse_date",
     "plan",
+    "reconstruction_reasons",
     "state_reasons",
     "survey_time_days",
     "validate_epoch_id",

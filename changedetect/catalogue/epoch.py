@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping
 from datetime import UTC, date, datetime, time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -40,12 +40,14 @@ _VARIABLE = re.compile(r"\$\{(\w+)\}")
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
 class Source:
     """
-    One file of observations, and how it is to be read.
+    One file of observations, or the folder of a flight, and how it is to be read.
 
     Attributes
     ----------
     uri : str
         Path of the file, relative to the programme's folder; ``${NAME}`` stands for an environment variable.
+    kind : {"points", "flight"}
+        A file of observations, or a folder with photos and logs that `update` makes points from.
     crs : str or None
         CRS of the file where the file itself does not say it.
     sigma : float or None, m
@@ -59,10 +61,16 @@ class Source:
     band : int
         Band of a raster, from 1.
     sha256, size, n_points : str, int (bytes), int, or None
-        What `add` found. A later change of the file is then noticed; None: taken as found when it is learned.
+        What `add` found. A later change of the file is then noticed; None: taken as found when it is learned. For a
+        flight `sha256` is that of `files` as `sha256sum` would list them, sorted by name.
+    n_photos : int or None
+        Of a flight.
+    files : mapping of str to str, or None
+        SHA-256 of every file of a flight, by its path relative to the folder.
     """
 
     uri: Annotated[str, Field(min_length=1)]
+    kind: Literal["points", "flight"] = "points"
     crs: str | None = None
     sigma: Annotated[float, Field(gt=0)] | None = None
     classes: tuple[Annotated[int, Field(ge=0, le=255)], ...] | None = None
@@ -72,6 +80,13 @@ class Source:
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
     size: Annotated[int, Field(ge=0)] | None = None
     n_points: Annotated[int, Field(ge=0)] | None = None
+    n_photos: Annotated[int, Field(ge=0)] | None = None
+    files: dict[str, Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]] | None = None
+
+    @property
+    def is_flight(self) -> bool:
+        """Whether it is the folder of a flight."""
+        return self.kind == "flight"
 
     @property
     def name(self) -> str:
@@ -102,6 +117,8 @@ class Source:
 
     def reading_options(self) -> dict[str, Any]:
         """Return what decides which observations the file yields."""
+        if self.is_flight:
+            return {"kind": self.kind}
         return {
             "crs": self.crs,
             "sigma": self.sigma,
@@ -134,6 +151,17 @@ class Epoch:
     sources: Annotated[tuple[Source, ...], Field(min_length=1)]
     label: str = ""
     region: Region | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a flight beside other sources: each is an epoch of its own."""
+        if len(self.sources) > 1 and any(source.is_flight for source in self.sources):
+            msg = "a flight is an epoch of its own; give each flight, and files of points, an epoch each"
+            raise ValueError(msg)
+
+    @property
+    def flight(self) -> Source | None:
+        """The flight this epoch is made of; None where it consists of files of points."""
+        return self.sources[0] if self.sources[0].is_flight else None
 
     @property
     def survey_time(self) -> float:
@@ -250,10 +278,14 @@ def write_epoch(path: Path, epoch: Epoch) -> None:
             "sha256": source.sha256,
             "size": source.size,
             "n_points": source.n_points,
+            "n_photos": source.n_photos,
         }
         if source.band == 1:
-            del known["band"]
+            known.pop("band", None)
         lines += [f"{key} = {format_toml_value(value)}" for key, value in known.items() if value is not None]
+        if source.files:
+            lines += ["", "[sources.files]"]
+            lines += [f"{format_toml_value(name)} = {format_toml_value(value)}" for name, value in source.files.items()]
     with atomic_path(path) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from changedetect.catalogue.epoch import Epoch, read_epoch, write_epoch
-from changedetect.catalogue.records import ProductRecord, StateRecord
+from changedetect.catalogue.records import ProductRecord, ReconstructionRecord, StateRecord
 from changedetect.config import (
     FORMAT_VERSION,
     PROGRAMME_FILE,
@@ -24,9 +24,12 @@ from changedetect.crs import check_programme_crs
 from changedetect.errors import ConfigError, InputDataError, MissingInputError, ModelStateError, OutputExistsError
 from changedetect.storage import atomic_path
 
-__all__ = ["ChangeProduct", "Programme"]
+__all__ = ["POINTS_FOLDER", "STEPS_FOLDER", "ChangeProduct", "Programme"]
 
 logger = logging.getLogger(__name__)
+
+#: Folders in `flights/EPOCH_ID/`: points with their manifest, whole or absent; steps, which may be deleted.
+POINTS_FOLDER, STEPS_FOLDER = "points", "steps"
 
 
 @dataclass(frozen=True)
@@ -154,6 +157,10 @@ class Programme:
         """Where the model of an epoch lies."""
         return self.directory / "state" / epoch_id
 
+    def flight_directory(self, epoch_id: str) -> Path:
+        """Where the points made from the flight of an epoch lie, and the steps that led to them."""
+        return self.directory / "flights" / epoch_id
+
     def product_directory(self, product_id: str) -> Path:
         """Where the products of an epoch, or of two (`EARLIER_LATER`), lie."""
         return self.directory / "products" / product_id
@@ -261,6 +268,10 @@ class Programme:
             logger.warning("%s", error)
             return None
         return found[0] if found else None
+
+    def reconstruction_record(self, epoch_id: str) -> tuple[ReconstructionRecord, str] | None:
+        """Manifest of the points made from an epoch's flight and its SHA-256; None where there are none."""
+        return ReconstructionRecord.read(self.flight_directory(epoch_id) / POINTS_FOLDER)
 
     def product_record(self, product_id: str) -> tuple[ProductRecord, str] | None:
         """Manifest of a folder of products and its SHA-256; None where there is none."""

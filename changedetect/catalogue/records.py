@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 __all__ = [
     "MANIFEST_FILE",
     "AlignmentRecord",
+    "AnchorRecord",
+    "CommonErrorRecord",
     "ProductRecord",
+    "ReconstructionRecord",
     "SourceRecord",
     "StateRecord",
     "damaged_files",
@@ -53,6 +56,8 @@ class SourceRecord:
         Points in the file after its filters, and those inside the programme's bounds.
     crs : str or None
         CRS the points were taken to be in.
+    derived_sha256 : str or None
+        Checksum of the manifest of the points that were made from it, where it is a flight.
     """
 
     uri: str
@@ -63,6 +68,7 @@ class SourceRecord:
     n_read: int
     n_used: int
     crs: str | None
+    derived_sha256: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +92,9 @@ class AlignmentRecord:
     estimate : mapping or None
         `Alignment.to_dict`: transform, covariance, residuals, the choice; None where nothing could be estimated, or
         nothing had to be.
+    shared_with : str or None
+        Epoch to whose photos this flight was adjusted, so that it lies as that one does: it was moved as that one was,
+        or not at all, and `estimate` is that one's transform, or what co-registration would have done.
     """
 
     reference: str
@@ -95,10 +104,13 @@ class AlignmentRecord:
     wording: str
     warnings: tuple[str, ...]
     estimate: Mapping[str, Any] | None
+    shared_with: str | None = None
 
     @property
     def kind(self) -> str:
-        """The kind of transform that was applied, or "none"."""
+        """The kind of transform that was applied, "photos" where photos bind the epoch to another, or "none"."""
+        if self.shared_with is not None:
+            return "photos"
         return str(self.estimate["transform"]["kind"]) if self.is_applied and self.estimate else "none"
 
     def applied(self) -> Alignment | None:
@@ -220,6 +232,7 @@ class StateRecord(_Manifest):
         """Fingerprint of what the epoch's own evidence follows from: its sources, how they are read, the settings."""
         parts = [self.epoch_id, self.survey_time, self.learning_sha256, self.n_points]
         parts += [[source.sha256, dict(source.options)] for source in self.sources]
+        parts += [source.derived_sha256 for source in self.sources if source.derived_sha256 is not None]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
@@ -245,7 +258,7 @@ class ProductRecord(_Manifest):
     software_version, run_id, created : str
     """
 
-    FORMAT: ClassVar[int] = 1
+    FORMAT: ClassVar[int] = 2
 
     epochs: tuple[str, ...]
     states: Mapping[str, str]
@@ -266,13 +279,138 @@ class ProductRecord(_Manifest):
         return _from_document(cls, {**document, **tuples}, path)
 
 
+@dataclass(frozen=True, kw_only=True)
+class CommonErrorRecord:
+    """
+    Error that all points of a flight, or the difference of two, have alike.
+
+    Attributes
+    ----------
+    centre : tuple (easting, northing), m
+        Where the offset is that of the covariance.
+    covariance : 5 x 5 numbers
+        Of offset (m), tilt east, tilt north (m per m), shift east, shift north (m).
+    residual_std : float, m
+        What poses and lens leave after these, root mean square over the points.
+    """
+
+    centre: tuple[float, float]
+    covariance: tuple[tuple[float, ...], ...]
+    residual_std: float
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], path: Path) -> Self:
+        """Build from a JSON object of `path`."""
+        lists = {
+            "centre": tuple(document.get("centre", ())),
+            "covariance": tuple(tuple(row) for row in document.get("covariance", ())),
+        }
+        return _from_document(cls, {**document, **lists}, path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnchorRecord:
+    """
+    An earlier flight that a flight was adjusted to.
+
+    Attributes
+    ----------
+    epoch_id : str
+    sha256 : str
+        Of the manifest of its points.
+    n_shared, n_moved : int
+        Ground points seen by both flights that bind them, and those left out because their ground changed.
+    difference : CommonErrorRecord or None
+        Of the later less the earlier heights; None where too few points are shared, so that nothing binds them.
+    """
+
+    epoch_id: str
+    sha256: str
+    n_shared: int
+    n_moved: int
+    difference: CommonErrorRecord | None
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], path: Path) -> Self:
+        """Build from a JSON object of `path`."""
+        difference = document.get("difference")
+        if difference is not None:
+            difference = CommonErrorRecord.from_document(difference, path)
+        return _from_document(cls, {**document, "difference": difference}, path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructionRecord(_Manifest):
+    """
+    Manifest of `flights/EPOCH_ID/points/`.
+
+    Attributes
+    ----------
+    epoch_id : str
+    source_uri, source_sha256 : str
+        Folder of the flight and checksum of its listing.
+    settings : mapping
+        `ProgrammeConfig.flight_settings`.
+    crs : str
+        Of the points.
+    origin : tuple (latitude, longitude, height), degrees and m above the ellipsoid
+        Of the local frame of `orientation.npz`.
+    photo_key, matching_key : str
+        Of the steps that the points follow from.
+    n_photos, n_points : int
+    region : tuple (west, east, south, north), m
+    common_error : CommonErrorRecord
+        Of the flight's heights against the Earth.
+    anchors : tuple of AnchorRecord
+        Earlier flights it was to be adjusted to.
+    warnings : tuple of str
+    files : mapping of file name to its size, bytes, and SHA-256
+    software_version, created : str
+    """
+
+    FORMAT: ClassVar[int] = 1
+
+    epoch_id: str
+    source_uri: str
+    source_sha256: str
+    settings: Mapping[str, Any]
+    crs: str
+    origin: tuple[float, float, float]
+    photo_key: str
+    matching_key: str
+    n_photos: int
+    n_points: int
+    region: tuple[float, float, float, float]
+    common_error: CommonErrorRecord
+    anchors: tuple[AnchorRecord, ...]
+    warnings: tuple[str, ...]
+    files: Mapping[str, Mapping[str, Any]]
+    software_version: str
+    created: str
+
+    @classmethod
+    def from_document(cls, document: Mapping[str, Any], path: Path) -> Self:
+        """Build from the JSON object of `path`."""
+        lists = ("origin", "region", "warnings")
+        given: dict[str, Any] = {key: tuple(document[key]) for key in lists if key in document}
+        given["anchors"] = tuple(AnchorRecord.from_document(item, path) for item in document.get("anchors", []))
+        given["common_error"] = CommonErrorRecord.from_document(document.get("common_error", {}), path)
+        return _from_document(cls, {**document, **given}, path)
+
+    @property
+    def bound(self) -> tuple[str, ...]:
+        """Epochs it was really adjusted to."""
+        return tuple(anchor.epoch_id for anchor in self.anchors if anchor.difference is not None)
+
+
 def _from_document(owner: type[T], document: Mapping[str, Any], path: Path) -> T:
-    names = [field.name for field in fields(owner)]  # type: ignore[arg-type]
-    missing = [name for name in names if name not in document]
+    names = [part.name for part in fields(owner)]  # type: ignore[arg-type]
+    needed = [part.name for part in fields(owner) if part.default is MISSING]  # type: ignore[arg-type]
+    missing = [name for name in needed if name not in document]
     if missing:
         msg = f"'{path}' is damaged: it lacks {', '.join(missing)}. `changedetect update` makes the folder anew."
         raise ModelStateError(msg)
-    return owner(**{name: document[name] for name in names})
+    return owner(**{name: document[name] for name in names if name in document})
 
 
 def describe_files(directory: Path) -> dict[str, dict[str, Any]]:

@@ -1,8 +1,9 @@
 """
 What has to be made, and why.
 
-A model is stale when its sources, date, settings or parent are not those it was learned from; a product when its
-models or settings are not those it was made from. Reasons are sentences for people; no reason means up to date.
+Points of a flight are stale when its files, the settings or the flights it is adjusted to are not those they were made
+with; a model when its sources, date, settings or parent are not those it was learned from; a product when its models or
+settings are not those it was made from. Reasons are sentences for people; no reason means up to date.
 """
 
 from __future__ import annotations
@@ -12,22 +13,24 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from changedetect.catalogue.epoch import Epoch, Source
-from changedetect.catalogue.programme import ChangeProduct, Programme
-from changedetect.catalogue.records import AlignmentRecord, SourceRecord, damaged_files
+from changedetect.catalogue.programme import POINTS_FOLDER, ChangeProduct, Programme
+from changedetect.catalogue.records import AlignmentRecord, AnchorRecord, SourceRecord, damaged_files
 from changedetect.errors import MissingInputError, ModelStateError
 from changedetect.storage import sha256_of_file
 
 __all__ = [
     "Item",
+    "anchors_of",
     "epoch_product_reasons",
     "own_state_reasons",
     "pair_reasons",
     "plan",
+    "reconstruction_reasons",
     "state_reasons",
     "wanted_pairs",
 ]
 
-Kind = Literal["model", "epoch", "pair"]
+Kind = Literal["flight", "model", "epoch", "pair"]
 
 #: A checksum that no manifest has: the model it stands for is still to be learned.
 _TO_BE_LEARNED = "to be learned"
@@ -40,8 +43,8 @@ class Item:
 
     Attributes
     ----------
-    kind : {"model", "epoch", "pair"}
-        The model of an epoch, the products of an epoch, or the products of two.
+    kind : {"flight", "model", "epoch", "pair"}
+        The points made from an epoch's flight, the model of an epoch, the products of an epoch, or those of two.
     item_id : str
         Epoch id, or ``EARLIER_LATER``.
     reasons : tuple of str
@@ -55,7 +58,8 @@ class Item:
     @property
     def title(self) -> str:
         """What it is, for people."""
-        return {"model": "model of ", "epoch": "maps of ", "pair": "difference "}[self.kind] + self.item_id
+        titles = {"flight": "points of ", "model": "model of ", "epoch": "maps of ", "pair": "difference "}
+        return titles[self.kind] + self.item_id
 
     @property
     def is_due(self) -> bool:
@@ -64,12 +68,25 @@ class Item:
 
 
 def plan(programme: Programme) -> tuple[Item, ...]:
-    """List model and maps of each epoch, then the differences, in the order they are made, each with why it is due."""
+    """
+    List what a programme has or should have, each thing with why it is due.
+
+    Returns
+    -------
+    items : tuple of Item
+        In the order they are made: of each epoch the points of its flight, its model, its maps; then the differences.
+    """
     items = []
+    flights: dict[str, str] = {}
     states: dict[str, str] = {}
     parent: Epoch | None = None
     for epoch in programme.epochs:
-        reasons = state_reasons(programme, epoch, parent, states)
+        if epoch.flight is not None:
+            reasons = reconstruction_reasons(programme, epoch, flights)
+            made = None if reasons else programme.reconstruction_record(epoch.epoch_id)
+            flights[epoch.epoch_id] = made[1] if made else _TO_BE_LEARNED
+            items.append(Item("flight", epoch.epoch_id, reasons))
+        reasons = state_reasons(programme, epoch, parent, states, flights.get(epoch.epoch_id))
         record = None if reasons else programme.state_record(epoch.epoch_id)
         states[epoch.epoch_id] = record[1] if record else _TO_BE_LEARNED
         items.append(Item("model", epoch.epoch_id, reasons))
@@ -90,8 +107,69 @@ def wanted_pairs(programme: Programme, epoch_ids: Sequence[str]) -> tuple[Change
     return (*asked, *(pair for pair in kept if pair not in asked))
 
 
+def anchors_of(programme: Programme, flights: Sequence[str]) -> tuple[str, ...]:
+    """
+    Return the earlier flights that a flight is to be adjusted to: the first, and the one before.
+
+    Parameters
+    ----------
+    programme : Programme
+    flights : sequence of str
+        Epoch ids of the flights before it, in order of time.
+    """
+    if programme.config.flights.joint == "never" or not flights:
+        return ()
+    return tuple(dict.fromkeys((flights[0], flights[-1])))
+
+
+def reconstruction_reasons(programme: Programme, epoch: Epoch, flights: Mapping[str, str]) -> tuple[str, ...]:
+    """
+    Say why points have to be made from the flight of an epoch.
+
+    Parameters
+    ----------
+    programme : Programme
+    epoch : Epoch
+        Whose source is a flight.
+    flights : mapping of epoch id to the SHA-256 of its points' manifest
+        Of the flights before it, in order of time.
+    """
+    try:
+        found = programme.reconstruction_record(epoch.epoch_id)
+    except ModelStateError as error:
+        return (str(error),)
+    if found is None:
+        return ("not reconstructed yet",)
+    record, source = found[0], epoch.flight
+    reasons = damaged_files(programme.flight_directory(epoch.epoch_id) / POINTS_FOLDER, record.files, deep=False)
+    reasons += _changed_settings(record.settings, programme.config.flight_settings)
+    if source is not None and source.sha256 is not None and source.sha256 != record.source_sha256:
+        reasons.append(f"flight {source.name} has another checksum")
+    elif source is not None and source.sha256 is None and source.uri != record.source_uri:
+        reasons.append(f"flight {source.uri} takes the place of {record.source_uri}")
+    wanted, known = anchors_of(programme, list(flights)), tuple(anchor.epoch_id for anchor in record.anchors)
+    if wanted != known:
+        reasons.append(f"it is to be adjusted to {_names(wanted)} now, and was adjusted to {_names(known)}")
+        return tuple(reasons)
+    if programme.config.flights.joint == "always" and wanted and not record.bound:
+        reasons.append(f"it is to be adjusted to {_names(wanted)}, and shares too little ground")
+    for anchor in record.anchors:
+        if anchor.sha256 != flights[anchor.epoch_id]:
+            reasons.append(f"flight {anchor.epoch_id}, which it is adjusted to, {_reconstructed(flights, anchor)}")
+    return tuple(reasons)
+
+
+def _names(epoch_ids: Sequence[str]) -> str:
+    return " and ".join(epoch_ids) if epoch_ids else "no flight"
+
+
+def _reconstructed(flights: Mapping[str, str], anchor: AnchorRecord) -> str:
+    is_due = flights[anchor.epoch_id] == _TO_BE_LEARNED
+    return "is to be reconstructed" if is_due else "was reconstructed again"
+
+
 def state_reasons(
-    programme: Programme, epoch: Epoch, parent: Epoch | None, states: Mapping[str, str]
+    programme: Programme, epoch: Epoch, parent: Epoch | None, states: Mapping[str, str], points: str | None = None
 ) -> tuple[str, ...]:
     """
     Say why the model of an epoch has to be learned.
@@ -104,8 +182,10 @@ def state_reasons(
         The epoch whose model it adapts.
     states : mapping of epoch id to the SHA-256 of its state's manifest
         Of the earlier epochs, in order; later ones are aligned to the first.
+    points : str or None
+        SHA-256 of the manifest of the points made from its flight; None where it has none.
     """
-    own = own_state_reasons(programme, epoch, _reference(states))
+    own = own_state_reasons(programme, epoch, _reference(states), points)
     found = programme.state_record(epoch.epoch_id) if own == () else None
     if found is None:
         return own
@@ -117,7 +197,9 @@ def state_reasons(
     return ()
 
 
-def own_state_reasons(programme: Programme, epoch: Epoch, reference_id: str | None) -> tuple[str, ...]:
+def own_state_reasons(
+    programme: Programme, epoch: Epoch, reference_id: str | None, points: str | None = None
+) -> tuple[str, ...]:
     """
     Say why the model of an epoch has to be learned from its sources, whatever its parent.
 
@@ -127,6 +209,8 @@ def own_state_reasons(programme: Programme, epoch: Epoch, reference_id: str | No
     epoch : Epoch
     reference_id : str or None
         Epoch it is aligned to; None where it is the first.
+    points : str or None
+        As for `state_reasons`.
     """
     try:
         found = programme.state_record(epoch.epoch_id)
@@ -138,6 +222,9 @@ def own_state_reasons(programme: Programme, epoch: Epoch, reference_id: str | No
     reasons = damaged_files(programme.state_directory(epoch.epoch_id), record.files, deep=False)
     reasons += _changed_settings(record.settings, programme.config.learning_settings)
     reasons += _changed_sources(programme, epoch.sources, record.sources)
+    if record.sources and record.sources[0].derived_sha256 != points:
+        is_due = points == _TO_BE_LEARNED
+        reasons.append(f"the points of its flight {'are to be made' if is_due else 'were made again'}")
     if record.survey_time != epoch.survey_time:
         reasons.append("its date has changed")
     reasons += _changed_alignment(programme, reference_id, record.alignment)
@@ -229,7 +316,7 @@ def _changed_sources(programme: Programme, sources: Sequence[Source], records: S
                 reasons.append(f"source {source.name} has another checksum")
         elif source.uri != record.uri:
             reasons.append(f"source {source.uri} takes the place of {record.uri}")
-        elif _file_differs(programme, source, record):
+        elif not source.is_flight and _file_differs(programme, source, record):
             reasons.append(f"source {source.name} has changed on disk")
     return reasons
 

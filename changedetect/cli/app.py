@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from changedetect import __version__
-from changedetect.cli import comparison, flights, programmes, results, runs
+from changedetect.cli import comparison, flights, programmes, results, runs, series, simulations
 
 __all__ = ["app"]
 
@@ -43,5 +43,7 @@ def _root(
 programmes.register(app)
 runs.register(app)
 results.register(app)
+series.register(app)
 comparison.register(app)
 flights.register(app)
+simulations.register(app)

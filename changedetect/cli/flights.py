@@ -20,6 +20,7 @@ class Method(StrEnum):
     ADJUSTED = "adjusted"
     SMOOTHED = "smoothed"
     PAPER = "paper"
+    GIVEN = "given"
 
 
 def register(app: typer.Typer) -> None:
@@ -33,7 +34,10 @@ def reconstruct(
     flights: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FLIGHT...", help="Flight folders over one site; several are adjusted together.", show_default=False
+            metavar="FLIGHT...",
+            help="Folders of logs and photos, of photos alone, or of a COLMAP or OpenSfM model; several are adjusted "
+            "together.",
+            show_default=False,
         ),
     ],
     output: Annotated[
@@ -51,11 +55,14 @@ def reconstruct(
         typer.Option("--crs", help="CRS of the points; by default that of site.json, else UTM, ellipsoidal heights."),
     ] = None,
     method: Annotated[
-        Method,
+        Method | None,
         typer.Option(
-            "--method", help="adjusted: bundle adjustment; smoothed: poses as they are; paper: filter and two views."
+            "--method",
+            help="adjusted: bundle adjustment; smoothed: poses of the logs; paper: filter and two views; given: poses "
+            "of a model as they are. By default given for models, else adjusted.",
+            show_default=False,
         ),
-    ] = Method.ADJUSTED,
+    ] = None,
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Estimate the lens parameters that the photos determine.")
     ] = False,
@@ -86,13 +93,15 @@ def reconstruct(
     changedetect reconstruct flight1 -o points.laz --crs EPSG:32756+4979
 
     changedetect reconstruct flight1 flight2 -o clouds --dense
+
+    changedetect reconstruct folder_of_photos -o points.laz --json
     """
     from changedetect.pipeline.reconstruct import ReconstructOptions, summary_lines
     from changedetect.pipeline.reconstruct import reconstruct as run
 
     options = ReconstructOptions(
         crs=crs,
-        method=method.value,
+        method=None if method is None else method.value,
         calibrate=calibrate,
         dense=dense,
         work=work,

@@ -1,8 +1,7 @@
-"""Commands that make a programme and its epochs: init, add, simulate, config show."""
+"""Commands that make a programme and its epochs: init, add, withdraw, config show."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -29,7 +28,6 @@ def register(app: typer.Typer) -> None:
     command(app, "init")(init)
     command(app, "add")(add)
     command(app, "withdraw")(withdraw)
-    command(app, "simulate")(simulate)
     config = typer.Typer(help="Settings of a programme.", no_args_is_help=True)
     command(config, "show", prefix="config ")(config_show)
     app.add_typer(config, name="config")
@@ -91,10 +89,15 @@ def add(
     epoch_id: EpochId,
     sources: Annotated[
         list[str],
-        typer.Argument(metavar="SOURCE...", help="Files: LAS, LAZ, COPC, PLY, CSV, XYZ, DEM.", show_default=False),
+        typer.Argument(
+            metavar="SOURCE...",
+            help="Files: LAS, LAZ, COPC, PLY, CSV, XYZ, DEM; or the folder of one flight.",
+            show_default=False,
+        ),
     ],
     date: Annotated[
-        str | None, typer.Option("--date", help="When it was surveyed (UTC); the epoch id by default, if it is a date.")
+        str | None,
+        typer.Option("--date", help="When it was surveyed (UTC); by default what a flight says, else the epoch id."),
     ] = None,
     label: Annotated[str, typer.Option("--label", help="A remark for people.")] = "",
     crs: Annotated[str | None, typer.Option("--crs", help="CRS of the files, where they do not say it.")] = None,
@@ -112,19 +115,21 @@ def add(
     dry_run: DryRun = False,
 ) -> Outcome:
     """
-    Add a survey epoch: read and check its files, remember them.
+    Add a survey epoch: read and check its files or its flight, remember them.
 
     For example:
 
     changedetect add site 2024-05-01 survey.laz --classes 2
 
     changedetect add site 2024-09-03 dsm.tif --crs EPSG:32632+5773 --sigma 0.05
+
+    changedetect add site 2025-05-01 flights/2025-05-01
     """
     from changedetect.catalogue import Source, parse_date, validate_epoch_id
     from changedetect.pipeline.ingest import add_epoch
 
     validate_epoch_id(epoch_id)
-    moment = parse_date(date, "--date") if date else parse_date(epoch_id, "no --date is given, and the epoch id")
+    moment = parse_date(date, "--date") if date else None
     listed = [
         Source(
             uri=source,
@@ -153,18 +158,25 @@ def add(
         "epoch_id": epoch_id,
         "date": added.epoch.date_text,
         "n_points": added.n_points,
+        "n_photos": added.n_photos,
         "region": list(added.region),
         "is_late": added.is_late,
         "sources": [
-            {"uri": source.uri, "sha256": source.sha256, "size": source.size, "n_points": source.n_points}
+            {
+                "uri": source.uri,
+                "kind": source.kind,
+                "sha256": source.sha256,
+                "size": source.size,
+                "n_points": source.n_points,
+                "n_photos": source.n_photos,
+                "n_files": None if source.files is None else len(source.files),
+            }
             for source in added.epoch.sources
         ],
     }
     done = "Would add" if dry_run else "Added"
-    text = (
-        f"{done} epoch {epoch_id} ({added.epoch.date_text}): {added.n_points:,} points. "
-        f"Next: changedetect update {directory}"
-    )
+    content = f"a flight of {added.n_photos} photos" if added.n_photos else f"{added.n_points:,} points"
+    text = f"{done} epoch {epoch_id} ({added.epoch.date_text}): {content}. Next: changedetect update {directory}"
     late = "It lies before other epochs; update learns those again after it."
     return Outcome(document, [text, late] if added.is_late else [text])
 
@@ -193,45 +205,6 @@ def withdraw(session: Session, *, directory: Directory, epoch_id: EpochId, dry_r
     text = (
         f"{done} epoch {epoch_id}; its file is kept as {kept_as}, its sources stay where they are. "
         f"Next: changedetect update {directory}"
-    )
-    return Outcome(document, [text])
-
-
-def simulate(
-    _session: Session,
-    *,
-    directory: Annotated[Path, typer.Argument(metavar="OUTDIR", help="Folder to make.", show_default=False)],
-    seed: Annotated[
-        int | None, typer.Option("--seed", help="Random seed; that of surveys/demo by default.", min=0)
-    ] = None,
-    density: Annotated[float, typer.Option("--density", help="Points per m2.", min=0.1, max=1000.0)] = 9.0,
-    overwrite: Overwrite = False,
-    dry_run: DryRun = False,
-) -> Outcome:
-    """
-    Make a programme of three simulated epochs with known truth.
-
-    For example:
-
-    changedetect simulate demo; changedetect update demo
-    """
-    from changedetect.pipeline.simulate import simulate as write_simulation
-    from changedetect.synthetic import DEMO_SEED
-
-    seed = DEMO_SEED if seed is None else seed
-    written = write_simulation(directory, seed, density=density, overwrite=overwrite, dry_run=dry_run)
-    document = {
-        "directory": str(directory),
-        "dry_run": dry_run,
-        "random_seed": seed,
-        "density": density,
-        "epochs": list(written.epoch_ids),
-        "n_points": written.n_points,
-        "files": list(written.files),
-    }
-    text = (
-        f"{'Would write' if dry_run else 'Wrote'} {len(written.epoch_ids)} epochs with {written.n_points:,} points, "
-        f"and their truth, into {directory}. Next: changedetect update {directory}"
     )
     return Outcome(document, [text])
 

@@ -165,7 +165,14 @@ def volume(
         float | None, typer.Option("--bands", metavar="HEIGHT", help="Budget per band of elevation of this height, m.")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="OUT.csv", help="Table to write.", show_default=False)
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT.csv|OUT.gpkg",
+            help="Table, or map of the zones, to write.",
+            show_default=False,
+        ),
     ] = None,
     overwrite: Overwrite = False,
     dry_run: DryRun = False,
@@ -178,6 +185,8 @@ def volume(
     changedetect volume site 2024-05-01 2024-09-03
 
     changedetect volume site 2024-05-01 2024-09-03 --zones cells.gpkg --bands 1.0 -o volumes.csv
+
+    changedetect volume site 2024-05-01 2024-09-03 --zones cells.gpkg -o volumes.gpkg
     """
     from changedetect.pipeline.volumes import measure_volumes
 

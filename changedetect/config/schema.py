@@ -22,6 +22,7 @@ __all__ = [
     "AdaptiveConfig",
     "CoregistrationConfig",
     "DifferencingConfig",
+    "FlightsConfig",
     "Key",
     "LWPRConfig",
     "MachineConfig",
@@ -158,10 +159,36 @@ class DifferencingConfig:
         Two-sided confidence of the level of detection and of the intervals in the summary.
     change_threshold_m : float, m
         The change whose exceedance `change_probability` states.
+    colour_limit_m : float or None, m
+        Change that maps show in full colour; None takes what suits the first map of the programme, for all maps.
     """
 
     confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.95
     change_threshold_m: Annotated[float, Field(ge=0)] = 0.10
+    predict_errors: bool = True
+    colour_limit_m: Annotated[float, Field(gt=0)] | None = None
+
+
+@dataclass(frozen=True, kw_only=True, config=_STRICT)
+class FlightsConfig:
+    """
+    How points are made from flights.
+
+    Attributes
+    ----------
+    joint : {"auto", "never", "always"}
+        Whether a flight is adjusted to the photos of the first flight of the programme and of the one before, whose
+        poses, points and models stay as they are. "auto" does so where enough ground is seen by both, "always"
+        refuses a flight where it is not.
+    dense : bool
+        A point for every cell of a fine grid.
+    calibrate : bool
+        Estimate the lens parameters that the photos of each flight determine.
+    """
+
+    joint: Literal["auto", "never", "always"] = "auto"
+    dense: bool = False
+    calibrate: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, config=_STRICT)
@@ -198,7 +225,7 @@ class ProgrammeConfig:
     pairs : {"consecutive", "first", "all"}
         Which epochs `update` differences: neighbours in time and the first with the last; each with the first;
         every two.
-    adaptive, lwpr, coregistration, differencing, machine
+    adaptive, lwpr, coregistration, flights, differencing, machine
         The sections of the file.
     """
 
@@ -214,6 +241,7 @@ class ProgrammeConfig:
     adaptive: AdaptiveConfig = Field(default_factory=AdaptiveConfig)
     lwpr: LWPRConfig = Field(default_factory=LWPRConfig)
     coregistration: CoregistrationConfig = Field(default_factory=CoregistrationConfig)
+    flights: FlightsConfig = Field(default_factory=FlightsConfig)
     differencing: DifferencingConfig = Field(default_factory=DifferencingConfig)
     machine: MachineConfig = Field(default_factory=MachineConfig)
 
@@ -249,6 +277,13 @@ class ProgrammeConfig:
         return grid | _dotted("differencing", self.differencing) if differencing else grid
 
     @property
+    def flight_settings(self) -> dict[str, Any]:
+        """Settings that the points made from a flight depend on by themselves, by dotted key."""
+        own = _dotted("flights", self.flights)
+        del own["flights.joint"]  # what a flight was adjusted to is recorded flight by flight
+        return {"crs": self.crs} | own
+
+    @property
     def learning_sha256(self) -> str:
         """Fingerprint of the settings a learned model depends on."""
         return _fingerprint(self.learning_settings)
@@ -256,7 +291,8 @@ class ProgrammeConfig:
     @property
     def config_sha256(self) -> str:
         """Fingerprint of the settings any result depends on; names, pairs and the machine are left out."""
-        return _fingerprint(self.learning_settings | self.product_settings(differencing=True))
+        flights = self.flight_settings | {"flights.joint": self.flights.joint}
+        return _fingerprint(self.learning_settings | flights | self.product_settings(differencing=True))
 
 
 def _dotted(section: str, settings: Any) -> dict[str, Any]:
@@ -272,6 +308,7 @@ SECTIONS: dict[str, type[Any]] = {
     "adaptive": AdaptiveConfig,
     "lwpr": LWPRConfig,
     "coregistration": CoregistrationConfig,
+    "flights": FlightsConfig,
     "differencing": DifferencingConfig,
     "machine": MachineConfig,
 }

@@ -7,6 +7,7 @@ from changedetect.coregistration.choice import Candidate
 from changedetect.coregistration.point_to_surface import align
 from changedetect.coregistration.reference import GridReference, ModelReference, ReferenceSurface
 from changedetect.coregistration.refusals import AlignmentError
+from changedetect.coregistration.resolutions import align_across_resolutions, differ_in_resolution
 from changedetect.coregistration.transform import KINDS, Kind, Transform
 
 __all__ = [
@@ -20,4 +21,6 @@ __all__ = [
     "ReferenceSurface",
     "Transform",
     "align",
+    "align_across_resolutions",
+    "differ_in_resolution",
 ]

@@ -92,6 +92,22 @@ class Alignment:
         easting, northing, elevation = self.transform.apply(*cloud.coordinates, cloud.elevation)
         return replace(cloud, easting=easting, northing=northing, elevation=elevation)
 
+    def inverted(self) -> Alignment:
+        """
+        Return the alignment of the reference to the epoch.
+
+        The covariance stays, since parameters change their sign and little else; residuals change theirs.
+        """
+        step, remarks = self.vertical_step, self.remarks
+        return replace(
+            self,
+            transform=self.transform.inverted(),
+            median_before=-self.median_before,
+            median_after=-self.median_after,
+            vertical_step=None if step is None else _exchanged(step, "below the reference", "above the reference"),
+            remarks=tuple(_exchanged(remark, "smaller than", "larger than") for remark in remarks),
+        )
+
     def offset_design(
         self,
         easting: FloatArray,
@@ -197,6 +213,11 @@ class Alignment:
                 "remarks": tuple(document["remarks"]),
             }
         )
+
+
+def _exchanged(text: str, one: str, other: str) -> str:
+    """Text with one phrase where the other stood."""
+    return text.replace(one, other) if one in text else text.replace(other, one)
 
 
 def _unit(name: str) -> str:

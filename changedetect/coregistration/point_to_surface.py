@@ -109,7 +109,8 @@ def align(
     choice = choose(sample, reference, vertical, kind)
     check_effective(choice.fit, choice.uncertainty)
     if kind == "auto" and area is None:
-        check_scatter(choice.fit)
+        sigma = sample.cloud.sigma
+        check_scatter(choice.fit, 0.0 if sigma is None else float(np.median(sigma)))
     alignment = _reported(choice, sample, before.residual, len(cloud), overlap)
     remarks = _remarks(choice, alignment, sample, None if area is None else area_names)
     alignment = replace(alignment, remarks=remarks)

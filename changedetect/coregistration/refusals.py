@@ -195,23 +195,30 @@ def _relief(fit: Fit, reference: ReferenceSurface) -> str:
     return f"slopes vary too little, by {100.0 * slopes:.1f} % rms over {2.0 * reference.reach:.1f} m"
 
 
-def check_scatter(fit: Fit) -> None:
+def check_scatter(fit: Fit, stated: float = 0.0) -> None:
     """
     Refuse ground that was found to agree although it scatters as changed ground does.
+
+    Parameters
+    ----------
+    fit : Fit
+    stated : float, m
+        Median standard deviation that the observations state; 0 where they state none.
 
     Notes
     -----
     What neighbouring observations do not share is their noise. Where the residuals of all the ground that agrees
     scatter by several times that and the uncertainty of the reference, either errors are correlated and large, or the
     ground changed nearly everywhere, gently, as beaches do; then the best transform would take the change for an
-    error. The two look alike.
+    error. The two look alike. Where observations state more than neighbours show, as those of photos do, whose poses
+    err together over metres, what is stated counts.
     """
     kept = fit.consensus.weight > 0.0
     residual = fit.residuals.residual[kept]
     places = np.column_stack([fit.residuals.easting[kept], fit.residuals.northing[kept]])
     nearest = np.asarray(cKDTree(places).query(places, k=2)[1])[:, 1]
     local = nmad(residual - residual[nearest]) / math.sqrt(2.0)
-    local = math.hypot(local, math.sqrt(float(np.median(fit.residuals.surface_variance[kept]))))
+    local = math.hypot(max(local, stated), math.sqrt(float(np.median(fit.residuals.surface_variance[kept]))))
     scatter = nmad(residual)
     is_simple = fit.transform.kind in ("vertical", "shift")
     limit = _LARGEST_SCATTER if is_simple else _LARGEST_SCATTER_TILTED

@@ -152,6 +152,23 @@ class Transform:
             parameters[6] = (1.0 + self["scale"]) * (1.0 + float(step[6])) - 1.0
         return type(self)(self.kind, self.centre, tuple(float(p) for p in parameters))
 
+    def inverted(self) -> Self:
+        """
+        Return the transform that undoes this one, about the moved centre.
+
+        Examples
+        --------
+        >>> there = Transform("rigid", (10.0, 20.0, 3.0), (0.5, -0.2, 1.0, 1e-3, 2e-3, -3e-3))
+        >>> back = there.inverted().apply(*there.apply(*(np.array([v]) for v in (40.0, 70.0, 5.0))))
+        >>> [round(float(v[0]), 9) for v in back]
+        [40.0, 70.0, 5.0]
+        """
+        centre = tuple(float(c + t) for c, t in zip(self.centre, self.shift, strict=True))
+        parameters = [-value for value in self.parameters]
+        if self.kind == "rigid_scale":
+            parameters[-1] = 1.0 / (1.0 + self["scale"]) - 1.0
+        return type(self)(self.kind, (centre[0], centre[1], centre[2]), tuple(parameters))
+
     def as_kind(self, kind: Kind) -> Self:
         """Return a transform of another kind with the parameters that both have; the others are 0."""
         return type(self)(kind, self.centre, tuple(self[name] for name in PARAMETER_NAMES[kind]))

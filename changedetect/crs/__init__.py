@@ -28,6 +28,7 @@ from changedetect.crs.definition import (
     to_wkt,
     vertical_part,
 )
+from changedetect.crs.geographic import enclosed_pole, to_longitude_latitude
 from changedetect.crs.transform import PointTransform, check_compatible, make_transform
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "check_compatible",
     "check_programme_crs",
     "crs_name",
+    "enclosed_pole",
     "height_unit",
     "horizontal_epsg",
     "horizontal_part",
@@ -45,6 +47,7 @@ __all__ = [
     "parse_crs",
     "surface_standard_name",
     "to_cf",
+    "to_longitude_latitude",
     "to_wkt",
     "vertical_part",
 ]

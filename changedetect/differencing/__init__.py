@@ -6,6 +6,13 @@ from changedetect.differencing.error_model import TooLittleGroundError
 from changedetect.differencing.maps import ChangeMaps
 from changedetect.differencing.objects import ChangeObject, ChangeObjects, find_objects_of_change
 from changedetect.differencing.pair import difference_models
+from changedetect.differencing.resolution import (
+    ObjectSize,
+    Resolution,
+    describe_resolution,
+    object_sizes,
+    resolution_classes,
+)
 from changedetect.differencing.summary import summarise, systematic_offset
 
 __all__ = [
@@ -14,12 +21,17 @@ __all__ = [
     "ChangeObject",
     "ChangeObjects",
     "CoherentTerm",
+    "ObjectSize",
     "Quantity",
+    "Resolution",
     "TooLittleGroundError",
     "area_budget",
+    "describe_resolution",
     "difference_models",
     "elevation_bands",
     "find_objects_of_change",
+    "object_sizes",
+    "resolution_classes",
     "sum_std",
     "summarise",
     "systematic_offset",

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import stats
 
+from changedetect.differencing.blocks import block_sums
 from changedetect.differencing.maps import NOT_OBSERVED
+from changedetect.differencing.outside import OutsideGround
 
 if TYPE_CHECKING:
     from changedetect.differencing.maps import ChangeMaps
@@ -106,24 +108,79 @@ def sum_std(
     The variance of sum_i w_i d_i is sum_ij w_i w_j (u_i u_j local(r_ij) + s_i s_j correlation(r_ij)) and what
     co-registration shares, with u and s the standard deviations of independent and correlated errors. Both
     correlations are sums of Gaussians, so each double sum is a few short convolutions on cells as coarse as the
-    range allows.
+    range allows. Where correlated errors are predicted from unchanged ground, that of the sum is predicted from the
+    ground outside the area, and the variance is that of what is left.
     """
-    used = (weights != 0.0) & np.isfinite(maps.dod[window])
-    if not used.any():
-        return 0.0
-    rows, cols = (np.flatnonzero(used.any(axis=axis)) for axis in (1, 0))
-    inner = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-    used, w = used[inner], np.where(used, weights, 0.0)[inner]
-    model = maps.errors.model
-    variance = model.local.variance_of_sum(w * np.where(used, maps.local_std[window][inner], 0.0), resolution)
-    if model.is_correlated:
-        scale = np.sqrt(np.where(used, maps.errors.correlated[window][inner], 0.0))
-        variance += model.correlation.variance_of_sum(w * scale, resolution)
-    if maps.errors.terms:
-        whole = np.zeros(maps.dod.shape)
-        whole[window][inner] = w
-        variance += sum(term.variance_of_sum(whole) for term in maps.errors.terms)
-    return math.sqrt(variance)
+    return _Area(maps, weights != 0.0, resolution, window).sum(weights)[1]
+
+
+class _Area:
+    """
+    Sums of change over an area and their standard deviations.
+
+    Where correlated errors are predicted the area's own ground takes no part: what is left of the sum's error after
+    its best prediction from the unchanged ground outside counts.
+    """
+
+    def __init__(
+        self, maps: ChangeMaps, inside: BoolArray, resolution: float, window: tuple[slice, slice] = _EVERYTHING
+    ) -> None:
+        self._maps, self._resolution = maps, resolution
+        used = inside & np.isfinite(maps.dod[window])
+        rows, cols = (np.flatnonzero(used.any(axis=axis)) for axis in (1, 0))
+        self._inner = np.s_[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1] if rows.size else None
+        if self._inner is None:
+            return
+        first = [s.indices(n)[0] for s, n in zip(window, maps.dod.shape, strict=True)]
+        self._window = tuple(
+            slice(start + s.start, start + s.stop) for start, s in zip(first, self._inner, strict=True)
+        )
+        self._used = used[self._inner]
+        self._outside: OutsideGround | None = None
+        prediction = maps.errors.prediction
+        if prediction is not None:
+            area = self._on_blocks(self._used.astype(np.float64)) > 0.0
+            model = maps.errors.model
+            self._outside = OutsideGround(prediction.data, area, (model.local, model.correlation.normalised()))
+
+    def sum(self, weights: FloatArray) -> tuple[float, float]:
+        """Weighted sum of the change and its standard deviation; weights of the shape of the window."""
+        if self._inner is None:
+            return 0.0, 0.0
+        maps, model, here = self._maps, self._maps.errors.model, self._window
+        w = np.where(self._used, weights[self._inner], 0.0)
+        measured = maps.dod[here] + maps.correlated_error[here]
+        total = float(np.sum(np.where(self._used, w * measured, 0.0)))
+        local = np.where(self._used, maps.local_std[here], 0.0)
+        variance = model.local.variance_of_sum(w * local, self._resolution)
+        scaled = w * np.sqrt(np.where(self._used, maps.errors.correlated[here], 0.0))
+        share, known = 1.0, None
+        if self._outside is not None and maps.errors.prediction is not None:
+            known = self._outside.predict(self._on_blocks(scaled))
+            total -= known.mean
+            share = float(maps.errors.prediction.inflated(known.share_left))
+        if model.is_correlated:
+            variance += share * model.correlation.variance_of_sum(scaled, self._resolution)
+        if maps.errors.terms:
+            whole = np.zeros(maps.dod.shape)
+            whole[here] = w
+            sums = np.concatenate([term.independent_sums(whole) for term in maps.errors.terms])
+            variance += float(np.sum((sums - (0.0 if known is None else known.coherent)) ** 2))
+        return total, math.sqrt(variance)
+
+    def _on_blocks(self, values: FloatArray) -> FloatArray:
+        """Sums over the finest blocks of the prediction of values on the area's window."""
+        prediction = self._maps.errors.prediction
+        if prediction is None:
+            return values
+        factor, shape = prediction.data.factor, prediction.data.mean.shape
+        starts = [s.start for s in self._window]
+        padded = np.pad(values, [(start % factor, 0) for start in starts])
+        sums = block_sums(padded, factor)
+        whole = np.zeros(shape)
+        place = tuple(slice(start // factor, start // factor + n) for start, n in zip(starts, sums.shape, strict=True))
+        whole[place] = sums
+        return whole
 
 
 def area_budget(
@@ -167,12 +224,13 @@ def area_budget(
     known = np.isfinite(dod)
     area = resolution**2
     weights = np.where(known, part * area, 0.0)
-    d = np.where(known, dod, 0.0)
-    p = np.full(d.shape, 0.5) if direction is None else direction
+    p = np.full(dod.shape, 0.5) if direction is None else direction
     observed = float(weights.sum())
 
+    ground = _Area(maps, weights > 0.0, resolution, window)
+
     def quantity(w: FloatArray) -> Quantity:
-        return _quantity(float(np.sum(w * d)), sum_std(maps, w, resolution, window), maps, confidence)
+        return _quantity(*ground.sum(w), maps, confidence)
 
     net = quantity(weights)
     mean = None

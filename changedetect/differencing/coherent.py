@@ -63,11 +63,53 @@ class CoherentTerm:
         ValueError
             The design is of another number of cells.
         """
+        self._check(shape)
+        quadratic = np.einsum("ij,jk,ik->i", self.design, self.covariance, self.design)
+        return np.asarray(quadratic.reshape(shape))
+
+    def independent_errors(self, shape: tuple[int, int]) -> list[FloatArray]:
+        """
+        Split the error into k uncorrelated ones.
+
+        Parameters
+        ----------
+        shape : (n_rows, n_cols)
+
+        Returns
+        -------
+        errors : list of array, shape (n_rows, n_cols), m
+            Each for one standard deviation; their squares add up to the variance.
+
+        Raises
+        ------
+        ValueError
+            The design is of another number of cells.
+        """
+        self._check(shape)
+        return [(self.design @ column).reshape(shape) for column in self._root().T]
+
+    def independent_sums(self, weights: FloatArray) -> FloatArray:
+        """
+        Weighted sums over all cells of each of the `independent_errors`, shape (k,).
+
+        Parameters
+        ----------
+        weights : array, shape (n_rows, n_cols)
+            Zero where the difference is not known.
+        """
+        flat = weights.ravel()
+        used = np.flatnonzero(flat)
+        return np.asarray((flat[used] @ self.design[used]) @ self._root())
+
+    def _root(self) -> FloatArray:
+        """R with covariance = R R', shape (k, k); the covariance may be singular."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+    def _check(self, shape: tuple[int, int]) -> None:
         if self.design.shape[0] != shape[0] * shape[1]:
             msg = f"a coherent term describes {self.design.shape[0]} cells; the map has {shape[0]} x {shape[1]}"
             raise ValueError(msg)
-        quadratic = np.einsum("ij,jk,ik->i", self.design, self.covariance, self.design)
-        return np.asarray(quadratic.reshape(shape))
 
     def variance_of_sum(self, weights: FloatArray) -> float:
         """

@@ -33,6 +33,10 @@ _MINIMUM_PAIRS = 500
 _NEGLIGIBLE = 1e-3
 #: Weight of the variance itself among the lags of the fit.
 _WEIGHT_AT_ZERO = 3.0
+#: Increments count by their relative error, which is taken as even below this value ...
+_LEAST_INCREMENT = 0.01
+#: ... and to grow with the lag beyond this part of the largest one.
+_EVEN_LAGS = 0.2
 
 
 @dataclass(frozen=True)
@@ -192,22 +196,31 @@ def _quadratic_form(weights: FloatArray, side: float, length: float) -> float:
 @dataclass(frozen=True)
 class PairProducts:
     """
-    Mean products of standardised differences of cells a lag apart.
+    Products and increments of standardised differences of cells a lag apart, and what they consist of.
+
+    With y the standardised difference, a and b the parts of its standard deviation that are due to independent and to
+    correlated errors.
 
     Attributes
     ----------
     distance : array, shape (n_lags,), m
     product : array, shape (n_lags,)
         Mean of y_i y_j.
+    increment : array, shape (n_lags,)
+        Mean of (y_i - y_j)^2 / 2.
     local, correlated : array, shape (n_lags,)
-        Mean of a_i a_j and b_i b_j, where a and b are the parts of each cell's standard deviation that are due to
-        independent and to correlated errors.
+        Means of a_i a_j and of b_i b_j.
+    local_square, correlated_square : array, shape (n_lags,)
+        Means of (a_i^2 + a_j^2) / 2 and of (b_i^2 + b_j^2) / 2.
     """
 
     distance: FloatArray
     product: FloatArray
+    increment: FloatArray
     local: FloatArray
     correlated: FloatArray
+    local_square: FloatArray
+    correlated_square: FloatArray
 
     @property
     def strength(self) -> float:
@@ -223,7 +236,7 @@ def collect_pairs(
     rng: np.random.Generator,
 ) -> PairProducts:
     """
-    Sample products of cells at lags from one cell to half the extent, in random directions.
+    Sample pairs of cells at lags from one cell to half the extent, in random directions.
 
     Parameters
     ----------
@@ -260,9 +273,10 @@ def collect_pairs(
         second = row[inside] * n_cols + col[inside]
         first = first[inside]
         distance = float(np.mean(np.hypot(down[inside], right[inside])))
-        rows.append((distance * resolution, *(float(np.mean(a[first] * a[second])) for a in flat)))
-    table = np.array(rows).reshape(-1, 4)
-    return PairProducts(table[:, 0], table[:, 1], table[:, 2], table[:, 3])
+        (y, z), (a, b), (u, v) = ((values[first], values[second]) for values in flat)
+        means = y * z, 0.5 * (y - z) ** 2, a * b, u * v, 0.5 * (a**2 + b**2), 0.5 * (u**2 + v**2)
+        rows.append((distance * resolution, *(float(np.mean(values)) for values in means)))
+    return PairProducts(*np.array(rows).reshape(-1, 7).T)
 
 
 def fit_correlation(
@@ -289,13 +303,22 @@ def fit_correlation(
     Notes
     -----
     E[y_i y_j] = a_i a_j local(r) + b_i b_j sum_k w_k exp(-r^2 / (2 r_k^2)) is linear in the shares w_k, which are
-    found by non-negative least squares over a bank of ranges r_k.
+    found by non-negative least squares over a bank of ranges r_k. So is the mean increment, which at short lags is
+    known far better than the products are: what the whole map shares cancels in it. How well errors can be predicted
+    from the ground around is decided there.
     """
     n = max(1, math.floor(math.log(max(longest / shortest, 1.0)) / math.log(_RANGE_RATIO) + 1e-9) + 1)
     ranges = shortest * _RANGE_RATIO ** np.arange(n)
     gaussians = np.exp(-0.5 * (pairs.distance[:, None] / ranges) ** 2)
-    design = np.vstack([gaussians * pairs.correlated[:, None], np.full((1, n), _WEIGHT_AT_ZERO * pairs.strength)])
-    wanted = np.append(pairs.product - pairs.local * local(pairs.distance), _WEIGHT_AT_ZERO * excess)
+    at_lag = local(pairs.distance)
+    products = gaussians * pairs.correlated[:, None]
+    increments = pairs.correlated_square[:, None] - products
+    increment_left = pairs.increment - (pairs.local_square - pairs.local * at_lag)
+    weight = 1.0 / np.maximum(pairs.increment, _LEAST_INCREMENT)
+    if pairs.distance.size:
+        weight /= 1.0 + pairs.distance / (_EVEN_LAGS * pairs.distance[-1])
+    design = np.vstack([products, increments * weight[:, None], np.full((1, n), _WEIGHT_AT_ZERO * pairs.strength)])
+    wanted = np.concatenate([pairs.product - pairs.local * at_lag, increment_left * weight, [_WEIGHT_AT_ZERO * excess]])
     shares, _ = nnls(design, wanted)
     kept = shares > _NEGLIGIBLE * max(float(shares.sum()), 1e-12)
     return NestedCorrelation(tuple(ranges[kept].tolist()), tuple(shares[kept].tolist()))

@@ -15,10 +15,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from changedetect.differencing.blocks import expand, standardise
+from changedetect.differencing.candidates import find_candidates
 from changedetect.differencing.clusters import normal_score
 from changedetect.differencing.correlation import NestedCorrelation, collect_pairs, fit_correlation
 from changedetect.differencing.error_scale import ErrorScale, Sample, fit_scale, half_width_scale, select_scale
-from changedetect.differencing.stable_ground import find_changed
+from changedetect.differencing.stable_ground import block_means, find_changed
+from changedetect.differencing.stencil import choose_stencil
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -31,6 +34,10 @@ __all__ = ["ErrorModel", "TooLittleGroundError", "estimate_errors"]
 _N_SAMPLE = 15_000
 #: Rounds of: scale, correlation, changed ground.
 _ROUNDS = 4
+#: Rounds more, in which changed ground is told by what the ground around says.
+_LATER_ROUNDS = 2
+#: Part of the known ground that must be left.
+_LEAST_SHARE = 0.3
 #: Scores count up to this limit, where the errors' tails are heavier than normal.
 _SCORE_LIMIT = 4.0
 #: Tails assumed while change has not been looked for.
@@ -180,7 +187,47 @@ def estimate_errors(
             if np.count_nonzero(left) < _LEAST_CELLS:
                 break
             ground = left
+    if stable is None and model.is_correlated:
+        model, ground = _estimate_again(difference, variance, covariates, known, ground, resolution, model)
     return replace(model, stable_share=float(np.count_nonzero(ground) / np.count_nonzero(known))), ground
+
+
+def _estimate_again(
+    difference: FloatArray,
+    variance: FloatArray,
+    covariates: Mapping[str, FloatArray],
+    known: BoolArray,
+    ground: BoolArray,
+    resolution: float,
+    model: ErrorModel,
+) -> tuple[ErrorModel, BoolArray]:
+    """
+    Model and ground once more, without what the ground around shows to have changed.
+
+    A change of one or two standard deviations of the correlated errors is not conspicuous by itself. It is against its
+    prediction from the ground around.
+    """
+    changed = known & ~ground
+    for k in range(_LATER_ROUNDS + 1):
+        variances = (variance, np.where(known, model.correlated_variance(covariates, known.shape), 1.0))
+        correlations = (model.local, model.correlation.normalised())
+        finest = standardise(np.where(known, difference, 0.0), variances, known, resolution)
+        chosen = choose_stencil(correlations[1], correlations[0], finest)
+        if chosen is None:
+            break
+        given = np.nan_to_num(block_means(changed.astype(np.float64), known, finest.factor)[0]) > 0.5
+        found = find_candidates(finest, chosen[0], correlations, given)
+        left = known & ~expand(found, finest.factor, known.shape)
+        if np.count_nonzero(left) < max(_LEAST_CELLS, _LEAST_SHARE * np.count_nonzero(known)):
+            break
+        ground = left
+        if k == _LATER_ROUNDS:
+            break
+        later = _estimate_round(difference, variance, covariates, ground, resolution, model, is_first=False)
+        if not later.is_correlated:
+            break
+        model = later
+    return model, ground
 
 
 def _estimate_round(

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special, stats
 
+from changedetect.differencing.resolution import FIELD_AREA, KERNEL_WIDTH, Resolution
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from changedetect.config import DifferencingConfig
     from changedetect.differencing.coherent import CoherentTerm
     from changedetect.differencing.error_model import ErrorModel
+    from changedetect.differencing.prediction import ErrorPrediction
     from changedetect.typing import BoolArray, FloatArray
 
 __all__ = [
@@ -57,6 +60,8 @@ class Evidence:
         Elevation that both epochs share, and its slope.
     correlation_length : float, m
         Side of the square over which estimates of neighbouring cells share their data.
+    resolution : Resolution, optional
+        What width of change the estimates resolve; where left out the same everywhere, from `correlation_length`.
     """
 
     difference: FloatArray
@@ -66,6 +71,7 @@ class Evidence:
     observed: tuple[BoolArray, BoolArray]
     terrain: tuple[FloatArray, FloatArray]
     correlation_length: float
+    resolution: Resolution | None = None
 
     @property
     def known(self) -> BoolArray:
@@ -90,6 +96,8 @@ class CellErrors:
         Where the latter comes from.
     stable : array, shape (n_rows, n_cols), bool
         Ground the model was estimated on.
+    prediction : ErrorPrediction, optional
+        Of the correlated errors from the ground around, and what is left of them.
     """
 
     model: ErrorModel
@@ -97,6 +105,17 @@ class CellErrors:
     coherent: FloatArray
     terms: tuple[CoherentTerm, ...]
     stable: BoolArray
+    prediction: ErrorPrediction | None = None
+
+    @property
+    def predicted(self) -> FloatArray:
+        """Predicted error of every cell, m, which is taken off the difference; 0 where nothing is predicted."""
+        return np.zeros(self.correlated.shape) if self.prediction is None else self.prediction.error
+
+    @property
+    def shared(self) -> FloatArray:
+        """Variance, m2, of what cells share and no prediction takes off."""
+        return self.correlated + self.coherent if self.prediction is None else self.prediction.variance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +126,7 @@ class ChangeMaps:
     Attributes
     ----------
     dod : array, m, float64
-        Elevation of the later epoch minus the earlier; NaN where not observed in both.
+        Elevation of the later epoch minus the earlier, less `correlated_error`; NaN where not observed in both.
     dod_std : array, m
         Standard deviation of `dod`.
     level_of_detection : array, m
@@ -128,6 +147,9 @@ class ChangeMaps:
         Part of `dod_std` that is due to independent errors of the observations.
     elevation : array, m
         Elevation that both epochs share; NaN where `dod` is.
+    correlated_error : array, m
+        Error that `dod` would have without correction, as predicted from the unchanged ground around; their sum is the
+        difference as measured. 0 where nothing is predicted; NaN where `dod` is.
     errors : CellErrors
         The other parts, and the model of the errors.
     """
@@ -144,7 +166,9 @@ class ChangeMaps:
     correlation_length: float
     local_std: FloatArray
     elevation: FloatArray
+    correlated_error: FloatArray
     errors: CellErrors
+    resolution: Resolution
 
 
 def judge_change(evidence: Evidence, errors: CellErrors, settings: DifferencingConfig) -> ChangeMaps:
@@ -169,9 +193,9 @@ def judge_change(evidence: Evidence, errors: CellErrors, settings: DifferencingC
     of the correlated errors are heavier than normal, std is the scale of a t distribution.
     """
     both = evidence.known
-    d = np.where(both, evidence.difference, np.nan)
+    d = np.where(both, evidence.difference - errors.predicted, np.nan)
     local = np.where(both, evidence.variance, np.nan)
-    variance = local + errors.correlated + errors.coherent
+    variance = local + errors.shared
     std = np.sqrt(variance)
     nu = _combined_freedom(local, errors, variance, np.maximum(evidence.freedom, 1.0))
     lod = _t_quantile(0.5 + 0.5 * settings.confidence, nu) * std
@@ -196,13 +220,25 @@ def judge_change(evidence: Evidence, errors: CellErrors, settings: DifferencingC
         correlation_length=evidence.correlation_length,
         local_std=np.sqrt(local),
         elevation=np.where(both, evidence.terrain[0], np.nan),
+        correlated_error=np.where(both, errors.predicted, np.nan),
         errors=errors,
+        resolution=_resolution(evidence).within(both),
     )
+
+
+def _resolution(evidence: Evidence) -> Resolution:
+    if evidence.resolution is not None:
+        return evidence.resolution
+    # a kernel averages over the area of a square of that side
+    kernel = evidence.correlation_length / math.sqrt(FIELD_AREA)
+    width = np.full(evidence.difference.shape, KERNEL_WIDTH * kernel)
+    return Resolution(width, width, np.full(width.shape, np.nan))
 
 
 def _combined_freedom(local: FloatArray, errors: CellErrors, variance: FloatArray, freedom: FloatArray) -> FloatArray:
     tails = errors.model.scale.freedom
-    spread = local**2 / freedom + (0.0 if math.isinf(tails) else errors.correlated**2 / tails)
+    shared = errors.correlated if errors.prediction is None else errors.prediction.variance
+    spread = local**2 / freedom + (0.0 if math.isinf(tails) else shared**2 / tails)
     return np.asarray(variance**2 / spread)
 
 

@@ -109,10 +109,11 @@ def find_objects_of_change(
     local = np.where(known, maps.local_std, 0.0) / total
     # what co-registration leaves moves whole maps and makes no regions; its share of the variance goes to the others
     correlated = np.sqrt(np.maximum(1.0 - local**2, 0.0)) if model.is_correlated else np.zeros(known.shape)
+    prediction = maps.errors.prediction
+    correlation = model.correlation.normalised() if prediction is None else prediction.correlation
     null = simulate_null(
-        (local, correlated), (model.local, model.correlation.normalised()), known, resolution, threshold,
-        np.random.default_rng(40),
-    )  # fmt: skip
+        (local, correlated), (model.local, correlation), known, resolution, threshold, np.random.default_rng(40)
+    )
     q = q_values(clusters.mass, null)
     reach = max(1, round(model.local.ranges[0] / resolution))
     items: list[ChangeObject] = []

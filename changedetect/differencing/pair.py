@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,8 @@ from changedetect.differencing.covariates import error_covariates
 from changedetect.differencing.error_model import estimate_errors
 from changedetect.differencing.error_scale import half_width_scale
 from changedetect.differencing.maps import CellErrors, ChangeMaps, Evidence, judge_change
+from changedetect.differencing.prediction import predict_errors
+from changedetect.differencing.resolution import Resolution
 from changedetect.differencing.shared_surface import FIELD_AREA, LocalDifference, estimate_difference
 from changedetect.models.lwpr import LWPRSurface
 from changedetect.models.pyramid import Lattice
@@ -29,6 +32,8 @@ __all__ = ["difference_models"]
 
 #: A cell counts as observed by a reference-mode epoch with at least this effective number of observations.
 _REFERENCE_MINIMUM = 2.0
+#: Full width at half maximum of the reference mode's Gaussian kernel, in kernels.
+_GAUSSIAN_WIDTH = math.sqrt(8.0 * math.log(2.0))
 #: The majority of the cells lies this many times its own scatter away from zero: the epochs are not aligned, and their
 #: offset is no measure of their errors.
 _OFFSET_RATIO = 1.5
@@ -75,7 +80,8 @@ def difference_models(
     -----
     In adaptive mode the evidence of the two epochs is differenced about one shared surface, see
     `estimate_difference`; what a model remembers of still earlier epochs takes no part. In reference mode the two
-    predictions are subtracted and their variances added. Either way `estimate_errors` adds the correlated errors.
+    predictions are subtracted and their variances added. Either way `estimate_errors` adds the correlated errors,
+    and `predict_errors` takes off what the unchanged ground around tells of them, if the settings say so.
     """
     if isinstance(earlier, LWPRSurface) and isinstance(later, LWPRSurface):
         evidence = _adaptive_evidence(earlier, later, grid)
@@ -87,11 +93,17 @@ def difference_models(
     if stable is not None and stable.shape != grid.shape:
         msg = f"stable ground has shape {stable.shape}, the grid {grid.shape}"
         raise ValueError(msg)
-    return judge_change(evidence, cell_errors(evidence, grid.resolution, stable, coherent), settings)
+    errors = cell_errors(evidence, grid.resolution, stable, coherent, predict=settings.predict_errors)
+    return judge_change(evidence, errors, settings)
 
 
 def cell_errors(
-    evidence: Evidence, resolution: float, stable: BoolArray | None = None, coherent: Sequence[CoherentTerm] = ()
+    evidence: Evidence,
+    resolution: float,
+    stable: BoolArray | None = None,
+    coherent: Sequence[CoherentTerm] = (),
+    *,
+    predict: bool = False,
 ) -> CellErrors:
     """
     Errors of every cell of a difference, by source.
@@ -103,6 +115,8 @@ def cell_errors(
     stable : array, shape (n_rows, n_cols), bool, optional
         Ground known not to have changed.
     coherent : sequence of CoherentTerm
+    predict : bool
+        Whether correlated errors are predicted from the unchanged ground around, where that is safe.
 
     Returns
     -------
@@ -124,7 +138,16 @@ def cell_errors(
     for term in coherent:
         shared += term.variance((shape[0], shape[1]))
     correlated = model.correlated_variance(covariates, (shape[0], shape[1]))
-    return CellErrors(model, correlated, shared, tuple(coherent), ground)
+    errors = CellErrors(model, correlated, shared, tuple(coherent), ground)
+    if not predict or not model.is_correlated:
+        return errors
+    prediction = predict_errors(
+        difference, (variance, correlated), model, ground, resolution,
+        [column for term in coherent for column in term.independent_errors((shape[0], shape[1]))],
+        is_given=stable is not None,
+        noise=math.exp(float(np.median(covariates["noise"][known]))),
+    )  # fmt: skip
+    return replace(errors, prediction=prediction)
 
 
 def _adaptive_evidence(earlier: LWPRSurface, later: LWPRSurface, grid: Grid) -> Evidence:
@@ -145,6 +168,7 @@ def _north_up(local: LocalDifference) -> Evidence:
         (local.observed[0][::-1], local.observed[1][::-1]),
         (local.terrain[0][::-1], local.terrain[1][::-1]),
         math.sqrt(FIELD_AREA) * local.kernel,
+        local.resolution.north_up(),
     )
 
 
@@ -161,6 +185,7 @@ def _reference_evidence(earlier: ReferenceLWPR, later: ReferenceLWPR, grid: Grid
         for count, p in zip(counts, (first, second), strict=True)
     )
     elevation = np.nan_to_num(0.5 * raster(first.elevation + second.elevation))
+    widths = [np.full(grid.shape, _GAUSSIAN_WIDTH * model.kernel_size) for model in (earlier, later)]
     north, east = np.gradient(elevation, grid.resolution) if min(grid.shape) > 1 else (elevation * 0.0,) * 2
     return Evidence(
         raster(second.elevation - first.elevation),
@@ -170,4 +195,5 @@ def _reference_evidence(earlier: ReferenceLWPR, later: ReferenceLWPR, grid: Grid
         (observed[0], observed[1]),
         (elevation, np.hypot(north, east)),
         max(earlier.kernel_size, later.kernel_size) * math.sqrt(4.0 * math.pi),
+        Resolution(widths[0], widths[1], np.full(grid.shape, np.nan)),
     )

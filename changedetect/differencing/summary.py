@@ -49,7 +49,8 @@ def summarise(
     -------
     summary : dict
         Areas in m2, volumes in m3 with standard deviations and intervals, changes in m; `error_model` says what
-        errors were found, `objects` how many regions of change. None stands for what cannot be stated because no
+        errors were found, `error_prediction` how far they were predicted from the ground around and taken off (None:
+        not at all), `objects` how many regions of change. None stands for what cannot be stated because no
         ground was observed twice.
 
     Notes
@@ -80,6 +81,7 @@ def summarise(
         "level_of_detection_median_m": float(np.median(maps.level_of_detection[both])) if d.size else None,
         "systematic_offset_m": systematic_offset(maps),
         "error_model": maps.errors.model.document(),
+        "error_prediction": None if maps.errors.prediction is None else maps.errors.prediction.document(),
         "objects": _count(objects),
     }
 

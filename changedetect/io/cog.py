@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["Category", "read_cog", "write_cog"]
+__all__ = ["Category", "read_cog", "storable_crs", "write_cog"]
 
 _CREATION_OPTIONS = {
     "BLOCKSIZE": "512",
@@ -125,7 +125,7 @@ def write_cog(
     vertical = vertical_part(grid.crs)
     if vertical is not None:
         tags = {**tags, "vertical_crs": vertical}
-    crs = _storable_crs(grid.crs)
+    crs = storable_crs(grid.crs)
     profile = {
         "driver": "GTiff",
         "height": grid.n_rows,
@@ -225,8 +225,8 @@ def _flag_tags(categories: Sequence[Category]) -> dict[str, str]:
     }
 
 
-def _storable_crs(text: str) -> str:
-    """Part of a CRS that GeoTIFF can express: all of it, or the horizontal part under ellipsoidal heights."""
+def storable_crs(text: str) -> str:
+    """Return the part of a CRS that GeoTIFF can express: all, or the horizontal part under ellipsoidal heights."""
     vertical = vertical_part(text)
     return horizontal_part(text) if vertical is not None and vertical.startswith("ellipsoid:") else text
 

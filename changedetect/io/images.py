@@ -29,6 +29,13 @@ __all__ = ["PhotoFiles", "photo_size"]
 
 #: Photos kept in memory, bytes.
 _CACHE_BYTES = 512 * 2**20
+#: How OpenCV reads grey pictures, whole or reduced while they are decoded.
+_READ = {
+    1: cv2.IMREAD_GRAYSCALE,
+    2: cv2.IMREAD_REDUCED_GRAYSCALE_2,
+    4: cv2.IMREAD_REDUCED_GRAYSCALE_4,
+    8: cv2.IMREAD_REDUCED_GRAYSCALE_8,
+}
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 #: Cameras append thumbnails and notes behind the end marker; a search this far back finds it, bytes.
 _TAIL = 2**20
@@ -45,6 +52,8 @@ class PhotoFiles:
         Width and height that the camera file states.
     camera : str
         Name of the camera file, for messages.
+    reduction : int
+        1, 2, 4 or 8: that many pixels, across and down, are read as one.
 
     Raises
     ------
@@ -54,11 +63,14 @@ class PhotoFiles:
         A photo cannot be read or has another size.
     """
 
-    def __init__(self, paths: Sequence[Path], size: tuple[int, int], camera: str = "the camera file") -> None:
+    def __init__(
+        self, paths: Sequence[Path], size: tuple[int, int], camera: str = "the camera file", reduction: int = 1
+    ) -> None:
         self.paths = tuple(paths)
+        self.reduction = reduction
         self._kept: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
         self._lock = Lock()
-        self._room = max(int(_CACHE_BYTES // (size[0] * size[1])), 2)
+        self._room = max(int(_CACHE_BYTES * reduction**2 // (size[0] * size[1])), 2)
         missing = [path for path in self.paths if not path.is_file()]
         if missing:
             names = ", ".join(path.name for path in missing[:5])
@@ -93,7 +105,7 @@ class PhotoFiles:
             if image in self._kept:
                 self._kept.move_to_end(image)
                 return self._kept[image]
-        grey = _read_grey(self.paths[image])
+        grey = _read_grey(self.paths[image], self.reduction)
         with self._lock:
             self._kept[image] = grey
             while len(self._kept) > self._room:
@@ -120,10 +132,10 @@ def photo_size(path: Path) -> tuple[int, int]:
         raise InputDataError(msg) from error
 
 
-def _read_grey(path: Path) -> NDArray[np.uint8]:
+def _read_grey(path: Path, reduction: int) -> NDArray[np.uint8]:
     if path.suffix.lower() in (".jpg", ".jpeg"):
         _require_whole_jpeg(path)
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    grey = cv2.imread(str(path), _READ[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
     if grey is None:
         msg = f"{path} cannot be decoded. Copy it again from the camera, or remove it from the list."
         raise InputDataError(msg)

@@ -26,7 +26,7 @@ from changedetect.io.cog import Category
 from changedetect.storage import write_dataset
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -35,7 +35,9 @@ if TYPE_CHECKING:
 __all__ = [
     "CHANGE_CLASSES",
     "CHANGE_LAYERS",
+    "CLASS_LAYERS",
     "CLASS_NODATA",
+    "RESOLUTION_CLASSES",
     "SURFACE_LAYERS",
     "ChangeMetadata",
     "Layer",
@@ -57,6 +59,14 @@ CHANGE_CLASSES = (
     Category(3, "not_observed", "not observed in both epochs", (189, 174, 108, 255)),
 )
 
+#: Which epoch limits what a difference resolves; see `changedetect.differencing.resolution_classes`.
+RESOLUTION_CLASSES = (
+    Category(0, "resolved_alike", "both epochs resolve alike", (235, 235, 235, 255)),
+    Category(1, "limited_by_earlier", "limited by the earlier epoch", (221, 204, 119, 255)),
+    Category(2, "limited_by_later", "limited by the later epoch", (136, 204, 238, 255)),
+    Category(3, "change_not_resolved", "change found, too small to resolve its height and outline", (136, 34, 85, 255)),
+)
+
 
 @dataclass(frozen=True)
 class Layer:
@@ -75,13 +85,32 @@ CHANGE_LAYERS = {
     "change_probability": Layer("probability that the elevation changed", "1"),
     "change_class": Layer("class of change", "1", standard_name="status_flag"),
     "z_score": Layer("change of elevation divided by its standard deviation", "1"),
+    "correlated_error": Layer(
+        "correlated error of the difference, as the unchanged ground around tells it",
+        "m",
+        "Taken off dod: dod plus this is the difference as measured. 0 where nothing is predicted.",
+    ),
     "n_observations_earlier": Layer(
         "effective number of observations, earlier epoch", "1", standard_name="number_of_observations"
     ),
     "n_observations_later": Layer(
         "effective number of observations, later epoch", "1", standard_name="number_of_observations"
     ),
+    "resolution": Layer(
+        "ground resolution of the change of elevation",
+        "m",
+        "Full width at half maximum of the mean that an answer is. Narrower change comes out lower and wider.",
+    ),
+    "unresolved_std": Layer(
+        "standard deviation of ground detail within the resolution",
+        "m",
+        "Detail of the finer epoch; whether it changed cannot be told. Not part of dod_std.",
+    ),
+    "resolution_class": Layer("what limits the ground resolution", "1", standard_name="status_flag"),
 }
+
+#: Layers of classes, with their classes.
+CLASS_LAYERS = {"change_class": CHANGE_CLASSES, "resolution_class": RESOLUTION_CLASSES}
 
 SURFACE_LAYERS = {
     "elevation": Layer("elevation of the surface", "m"),
@@ -190,7 +219,7 @@ def change_dataset(layers: Mapping[str, NDArray[Any]], grid: Grid, meta: ChangeM
     Parameters
     ----------
     layers : mapping of name to array, shape (n_rows, n_cols)
-        All of `CHANGE_LAYERS`: floating point with NaN for no data; `change_class` uint8 with 255.
+        All of `CHANGE_LAYERS`: floating point with NaN for no data; those of `CLASS_LAYERS` uint8 with 255.
     grid : Grid
     meta : ChangeMetadata
 
@@ -198,7 +227,7 @@ def change_dataset(layers: Mapping[str, NDArray[Any]], grid: Grid, meta: ChangeM
     -------
     dataset : xarray.Dataset
         Dimensions (time, y, x), one time: the later epoch, with bounds [earlier, later]. Layers are float32,
-        `change_class` int8 with -1 for no data.
+        classes int8 with -1 for no data.
 
     Raises
     ------
@@ -208,7 +237,7 @@ def change_dataset(layers: Mapping[str, NDArray[Any]], grid: Grid, meta: ChangeM
     _check_layers(layers, CHANGE_LAYERS, grid)
     earlier, later = _seconds(meta.datetime_earlier), _seconds(meta.datetime_later)
     variables = {name: _variable(layers[name], layer) for name, layer in CHANGE_LAYERS.items()}
-    variables["change_class"] = _class_variable(layers["change_class"])
+    variables |= {name: _class_variable(name, layers[name], classes) for name, classes in CLASS_LAYERS.items()}
     variables["dod"].attrs["ancillary_variables"] = " ".join(name for name in CHANGE_LAYERS if name != "dod")
     variables["level_of_detection"].attrs["comment"] = (
         f"A change larger than this, either way, is significant at a confidence of {meta.confidence:g} (two-sided): "
@@ -218,7 +247,7 @@ def change_dataset(layers: Mapping[str, NDArray[Any]], grid: Grid, meta: ChangeM
         f"Probability that the absolute change exceeds {meta.change_threshold:g} m."
     )
     title = f"{meta.programme}: change of elevation from {meta.epoch_earlier} to {meta.epoch_later}"
-    attributes = _global_attributes(grid, meta, title, meta.datetime_earlier, meta.datetime_later) | {
+    attributes = global_attributes(grid, meta, title, meta.datetime_earlier, meta.datetime_later) | {
         "id": f"{meta.programme}-{meta.epoch_earlier}-{meta.epoch_later}-dod",
         "epoch_earlier": meta.epoch_earlier,
         "epoch_later": meta.epoch_later,
@@ -257,7 +286,7 @@ def surface_dataset(layers: Mapping[str, NDArray[Any]], grid: Grid, meta: Surfac
     if standard_name is not None:
         variables["elevation"].attrs["standard_name"] = standard_name
         variables["elevation_std"].attrs["standard_name"] = f"{standard_name} standard_error"
-    attributes = _global_attributes(grid, meta, f"{meta.programme}: surface of {meta.epoch}", first, last) | {
+    attributes = global_attributes(grid, meta, f"{meta.programme}: surface of {meta.epoch}", first, last) | {
         "id": f"{meta.programme}-{meta.epoch}",
         "epoch": meta.epoch,
     }
@@ -328,18 +357,18 @@ def _variable(array: NDArray[Any], layer: Layer) -> xr.Variable:
     return xr.Variable(("time", "y", "x"), np.asarray(array, dtype=np.float32)[np.newaxis], attributes)
 
 
-def _class_variable(classes: NDArray[Any]) -> xr.Variable:
-    values = [c.value for c in CHANGE_CLASSES]
+def _class_variable(name: str, classes: NDArray[Any], categories: Sequence[Category]) -> xr.Variable:
+    values = [c.value for c in categories]
     unknown = np.setdiff1d(np.unique(classes), [*values, CLASS_NODATA])
     if unknown.size:
-        msg = f"Unknown values in change_class: {unknown.tolist()}; allowed are {values}, {CLASS_NODATA} for no data."
+        msg = f"Unknown values in {name}: {unknown.tolist()}; allowed are {values}, {CLASS_NODATA} for no data."
         raise ValueError(msg)
-    layer = CHANGE_LAYERS["change_class"]
+    layer = CHANGE_LAYERS[name]
     attributes = {
         "long_name": layer.long_name,
         "standard_name": layer.standard_name,
         "flag_values": np.array(values, dtype=np.int8),
-        "flag_meanings": " ".join(c.meaning for c in CHANGE_CLASSES),
+        "flag_meanings": " ".join(c.meaning for c in categories),
         "valid_range": np.array([min(values), max(values)], dtype=np.int8),
         "grid_mapping": "spatial_ref",
         "cell_methods": "area: point",
@@ -363,19 +392,19 @@ def _dataset(
     edges_x, edges_y = west + steps_x * grid.resolution, north - steps_y * grid.resolution
     coordinates = {
         "time": ("time", np.array([time]), _TIME_ATTRIBUTES),
-        "y": ("y", grid.northing, _axis_attributes("y")),
-        "x": ("x", grid.easting, _axis_attributes("x")),
+        "y": ("y", grid.northing, axis_attributes("y")),
+        "x": ("x", grid.easting, axis_attributes("x")),
     }
     auxiliary = {
         "time_bnds": (("time", "nv"), np.array([[first, last]])),
         "y_bnds": (("y", "nv"), np.column_stack([edges_y[:-1], edges_y[1:]])),
         "x_bnds": (("x", "nv"), np.column_stack([edges_x[:-1], edges_x[1:]])),
-        "spatial_ref": ((), np.int32(0), _grid_mapping(grid)),
+        "spatial_ref": ((), np.int32(0), grid_mapping(grid)),
     }
     return xr.Dataset({**variables, **auxiliary}, coordinates, dict(attributes))
 
 
-def _axis_attributes(name: str) -> dict[str, str]:
+def axis_attributes(name: str) -> dict[str, str]:
     direction = {"x": "easting", "y": "northing"}[name]
     return {
         "standard_name": f"projection_{name}_coordinate",
@@ -386,14 +415,14 @@ def _axis_attributes(name: str) -> dict[str, str]:
     }
 
 
-def _grid_mapping(grid: Grid) -> dict[str, Any]:
+def grid_mapping(grid: Grid) -> dict[str, Any]:
     """CF attributes, and the two that GDAL reads: `spatial_ref` and `GeoTransform` (west, a, b, north, d, e)."""
     a, b, c, d, e, f = grid.transform
     geotransform = " ".join(repr(v) for v in (c, a, b, f, d, e))
     return {**to_cf(grid.crs), "spatial_ref": to_wkt(grid.crs), "GeoTransform": geotransform}
 
 
-def _global_attributes(grid: Grid, meta: ProductMetadata, title: str, first: str, last: str) -> dict[str, Any]:
+def global_attributes(grid: Grid, meta: ProductMetadata, title: str, first: str, last: str) -> dict[str, Any]:
     west, east, south, north = grid.region
     epsg, vertical = horizontal_epsg(grid.crs), vertical_part(grid.crs)
     ring = ((west, south), (east, south), (east, north), (west, north), (west, south))

@@ -7,7 +7,6 @@ raster of another.
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +16,8 @@ import numpy as np
 
 from changedetect.io.cog import write_cog
 from changedetect.io.netcdf import (
-    CHANGE_CLASSES,
     CHANGE_LAYERS,
+    CLASS_LAYERS,
     CLASS_NODATA,
     SURFACE_LAYERS,
     ChangeMetadata,
@@ -27,6 +26,7 @@ from changedetect.io.netcdf import (
     write_surface,
 )
 from changedetect.io.qml import write_diverging_style, write_paletted_style, write_sequential_style
+from changedetect.io.vrt import write_significant_change
 from changedetect.storage import atomic_directory, sha256_of_file
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CHANGE_RASTERS",
+    "SIGNIFICANT_CHANGE",
     "SURFACE_RASTERS",
     "ChangeMetadata",
     "ProductFile",
@@ -47,11 +48,23 @@ __all__ = [
     "write_epoch_products",
 ]
 
-logger = logging.getLogger(__name__)
-
 #: Layers of a pair and of an epoch that are published as GeoTIFF; the NetCDF file holds all layers.
-CHANGE_RASTERS = ("dod", "dod_std", "level_of_detection", "change_probability", "change_class")
+CHANGE_RASTERS = (
+    "dod",
+    "dod_std",
+    "level_of_detection",
+    "change_probability",
+    "change_class",
+    "resolution",
+    "resolution_class",
+)
 SURFACE_RASTERS = ("elevation", "elevation_std", "noise_std", "age_days")
+#: The virtual raster of the change where it is significant, 0 where it is not.
+SIGNIFICANT_CHANGE = "dod_significant"
+#: The neutral band of the change reaches over the level of detection of this share (percent) of the cells ...
+_NEUTRAL_PERCENTILE = 95.0
+#: ... but not beyond this multiple of the median: few bad cells must not turn a whole map grey.
+_NEUTRAL_MEDIANS = 2.0
 
 
 @dataclass(frozen=True)
@@ -72,8 +85,8 @@ def write_change_products(
     add_files: Callable[[Path], None] | None = None,
 ) -> list[ProductFile]:
     """
-    Publish the change between two epochs: `dod.tif`, `dod_std.tif`, `level_of_detection.tif`,
-    `change_probability.tif`, `change_class.tif`, a `.qml` for each, and `change.nc` with all layers.
+    Publish the change between two epochs: a GeoTIFF for each of `CHANGE_RASTERS`, `dod_significant.vrt`, a `.qml` for
+    each of these, and `change.nc` with all layers.
 
     Parameters
     ----------
@@ -81,7 +94,7 @@ def write_change_products(
         Folder of the pair. An existing one is replaced as a whole, or left as it is when anything fails.
     change : mapping of name to array, shape (n_rows, n_cols)
         All of `changedetect.io.netcdf.CHANGE_LAYERS`: floating point with NaN for no data, m where they are lengths;
-        `change_class` uint8 (0 below level of detection, 1 lowered, 2 raised, 3 not observed, 255 outside all data).
+        `change_class` and `resolution_class` uint8 (values of `CLASS_LAYERS`, 255 outside all data).
     grid : Grid
     meta : ChangeMetadata
     add_files : callable taking the folder, optional
@@ -109,7 +122,7 @@ def write_change_products(
     with atomic_directory(Path(directory)) as folder:
         write_change(folder / "change.nc", change, grid, meta)
         for name in CHANGE_RASTERS:
-            is_class = name == "change_class"
+            is_class = name in CLASS_LAYERS
             write_cog(
                 folder / f"{name}.tif",
                 change[name],
@@ -118,9 +131,16 @@ def write_change_products(
                 description=CHANGE_LAYERS[name].long_name,
                 unit=CHANGE_LAYERS[name].unit,
                 tags=tags | {"layer": name},
-                categories=CHANGE_CLASSES if is_class else None,
+                categories=CLASS_LAYERS.get(name),
                 overview="mode" if is_class else "average",
             )
+        write_significant_change(
+            folder / f"{SIGNIFICANT_CHANGE}.vrt",
+            grid,
+            description=f"{CHANGE_LAYERS['dod'].long_name}; 0 where below the level of detection",
+            dod="dod.tif",
+            change_class="change_class.tif",
+        )
         _write_change_styles(folder, change, meta)
         if add_files is not None:
             add_files(folder)
@@ -196,38 +216,45 @@ def _inventory(folder: Path) -> list[ProductFile]:
 
 
 def _write_change_styles(folder: Path, change: Mapping[str, NDArray[Any]], meta: ChangeMetadata) -> None:
-    _write_dod_style(folder / "dod.qml", change["dod"], change["level_of_detection"], meta.colour_limits)
-    for name in ("dod_std", "level_of_detection"):
+    _write_dod_styles(folder, change["dod"], change["level_of_detection"], meta.colour_limits)
+    for name in ("dod_std", "level_of_detection", "resolution"):
         limits = _limits(name, change[name], meta.colour_limits, is_from_zero=True)
         write_sequential_style(folder / f"{name}.qml", *limits, unit="m")
     limits = meta.colour_limits.get("change_probability", (0.0, 1.0))
     write_sequential_style(folder / "change_probability.qml", *limits, unit="")
-    write_paletted_style(folder / "change_class.qml", CHANGE_CLASSES)
+    for name, classes in CLASS_LAYERS.items():
+        write_paletted_style(folder / f"{name}.qml", classes)
 
 
-def _write_dod_style(
-    path: Path,
+def _write_dod_styles(
+    folder: Path,
     dod: NDArray[Any],
     level_of_detection: NDArray[Any],
     colour_limits: Mapping[str, tuple[float, float]],
 ) -> None:
-    """Neutral within the median level of detection, full colour at the programme's limit."""
+    """
+    Styles of the change and of the significant change, in the programme's colours.
+
+    A style sees values alone. So that colour means significance in the change itself too, its neutral band is about as
+    wide as the largest level of detection; the significant change is neutral cell by cell.
+    """
     finite = level_of_detection[np.isfinite(level_of_detection)]
-    neutral = float(np.median(finite)) if finite.size else 0.0
+    neutral = smallest = 0.0
+    if finite.size:
+        median, high = (float(v) for v in np.percentile(finite, (50.0, _NEUTRAL_PERCENTILE)))
+        neutral, smallest = min(high, _NEUTRAL_MEDIANS * median), float(finite.min())
     if "dod" in colour_limits:
         limit = max(abs(bound) for bound in colour_limits["dod"])
     else:
         limit = _limits("dod", np.abs(dod), {}, is_from_zero=True)[1]
-    if limit < 2.0 * neutral:
-        logger.warning(
-            "Colours of %s reach to %.3g m instead of %.3g m: the median level of detection is %.3g m",
-            path.name,
-            2.0 * neutral,
-            limit,
-            neutral,
-        )
-        limit = 2.0 * neutral
-    write_diverging_style(path, limit, level_of_detection=neutral, unit="m")
+    write_diverging_style(folder / "dod.qml", limit, level_of_detection=neutral, unit="m")
+    write_diverging_style(
+        folder / f"{SIGNIFICANT_CHANGE}.qml",
+        limit,
+        level_of_detection=smallest,
+        unit="m",
+        neutral_label="below the level of detection of the cell",
+    )
 
 
 def _limits(

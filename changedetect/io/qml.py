@@ -27,15 +27,18 @@ if TYPE_CHECKING:
 __all__ = ["write_diverging_style", "write_paletted_style", "write_sequential_style"]
 
 _DOCTYPE = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
-_NEUTRAL = "#f7f7f7"
-#: From just outside the level of detection to the limit, RdBu of [1]_.
+#: Darker than paper, so that ground which was compared and found unchanged does not look like ground without data.
+_NEUTRAL = "#e8e8e8"
+#: At 0, 1/3, 2/3 and all of the limit, RdBu of [1]_.
 _REDS = ("#fddbc7", "#ef8a62", "#b2182b", "#67001f")
 _BLUES = ("#d1e5f0", "#67a9cf", "#2166ac", "#053061")
 #: Five stops of cividis, [2]_.
 _SEQUENTIAL = ("#00224e", "#434e6c", "#7d7c78", "#bcae6c", "#fee838")
 
 
-def write_diverging_style(path: Path, limit: float, *, level_of_detection: float = 0.0, unit: str = "m") -> None:
+def write_diverging_style(
+    path: Path, limit: float, *, level_of_detection: float = 0.0, unit: str = "m", neutral_label: str = ""
+) -> None:
     """
     Write a style symmetric about zero: red where lowered, blue where raised.
 
@@ -46,35 +49,51 @@ def write_diverging_style(path: Path, limit: float, *, level_of_detection: float
     limit : float
         Value of full colour; larger changes keep that colour.
     level_of_detection : float
-        Values within +- this are neutral grey; the colour starts with a visible step outside.
+        Values within +- this are neutral grey; the colour starts with a visible step outside. It may exceed `limit`.
     unit : str
         Shown in the legend.
+    neutral_label : str
+        Words for the neutral band in the legend, instead of its width.
 
     Raises
     ------
     ValueError
-        `limit` is not finite and above `level_of_detection`, or that is negative.
+        `limit` is not finite and positive, or `level_of_detection` is negative or not finite.
     OutputError
         The file cannot be written.
+
+    Notes
+    -----
+    A colour is a function of the value and the limit alone: where two maps share the limit, the same colour means the
+    same change. The level of detection only cuts the neutral band out of it.
     """
-    if not (math.isfinite(limit) and 0.0 <= level_of_detection < limit):
+    if not (math.isfinite(limit) and limit > 0.0 and math.isfinite(level_of_detection) and level_of_detection >= 0.0):
         msg = (
-            f"A diverging style needs 0 <= level_of_detection < limit < inf; got level_of_detection "
-            f"{level_of_detection!r} and limit {limit!r}."
+            f"A diverging style needs a finite limit above 0 and a finite level_of_detection of at least 0; got limit "
+            f"{limit!r} and level_of_detection {level_of_detection!r}."
         )
         raise ValueError(msg)
-    steps = len(_REDS) - 1
-    width = limit - level_of_detection
+    values = [limit * k / (len(_REDS) - 1) for k in range(len(_REDS))]
     # the first stop lies a millionth of the range outside the neutral band, which makes the step
-    values = [level_of_detection + width * max(i / steps, 1e-6) for i in range(steps + 1)]
-    stops = [(-v, c, f"{-v:+.3g} {unit}") for v, c in zip(reversed(values), reversed(_REDS), strict=True)]
+    start = max(level_of_detection, 0.0) + 1e-6 * limit
+    kept = [start, *(v for v in values if v > start)]
+    reds, blues = ([(v, _colour_at(v, values, ramp)) for v in kept] for ramp in (_REDS, _BLUES))
+    stops = [(-v, c, f"{-v:+.3g} {unit}") for v, c in reversed(reds)]
     if level_of_detection > 0.0:
-        within = f"within +/-{level_of_detection:.3g} {unit} (level of detection)"
+        within = neutral_label or f"within +/-{level_of_detection:.3g} {unit} (level of detection)"
         stops += [(-level_of_detection, _NEUTRAL, within), (level_of_detection, _NEUTRAL, within)]
     else:
         stops.append((0.0, _NEUTRAL, f"0 {unit}"))
-    stops += [(v, c, f"{v:+.3g} {unit}") for v, c in zip(values, _BLUES, strict=True)]
+    stops += [(v, c, f"{v:+.3g} {unit}") for v, c in blues]
     _write(path, _pseudocolour(stops))
+
+
+def _colour_at(value: float, values: Sequence[float], ramp: Sequence[str]) -> str:
+    """Colour of a ramp at a value, between its stops in proportion, beyond them that of the end."""
+    k = min(max(sum(v <= value for v in values) - 1, 0), len(values) - 2)
+    share = min(max((value - values[k]) / (values[k + 1] - values[k]), 0.0), 1.0)
+    channels = ((int(ramp[j][i : i + 2], 16) for j in (k, k + 1)) for i in (1, 3, 5))
+    return "#" + "".join(f"{round((1.0 - share) * low + share * high):02x}" for low, high in channels)
 
 
 def write_sequential_style(path: Path, minimum: float, maximum: float, *, unit: str = "m") -> None:

@@ -13,7 +13,7 @@ from changedetect.kernels import moments as kernel
 if TYPE_CHECKING:
     from typing import Self
 
-    from changedetect.typing import Coordinates, FloatArray, IntArray, Region
+    from changedetect.typing import BoolArray, Coordinates, FloatArray, IntArray, Region
 
 __all__ = ["TILE_CELLS", "Cells", "Evidence", "merge_cells"]
 
@@ -113,6 +113,10 @@ class Cells:
         moments = self.moments.copy()
         moments[:, 12] = moments[:, 0] * variance
         return replace(self, moments=moments)
+
+    def select(self, kept: BoolArray) -> Self:
+        """Only some of the cells; `kept` has shape (m,)."""
+        return replace(self, row=self.row[kept], column=self.column[kept], moments=self.moments[kept])
 
     def coarsened(self) -> Cells:
         """Moments over cells of twice the size."""

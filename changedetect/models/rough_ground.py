@@ -92,8 +92,7 @@ def process_variance(left: Cells, lattice: Lattice, length: float, radius: float
 
     def window_sum(values: FloatArray, reach: float) -> FloatArray:
         binned = np.bincount(field, values, lattice.n_rows * lattice.n_columns).reshape(lattice.shape)
-        smoothed: FloatArray = gaussian_filter(binned, reach, truncate=3.0, mode="constant")
-        return smoothed
+        return np.asarray(gaussian_filter(binned, reach, truncate=3.0, mode="constant"), np.float64)
 
     product, mass, square = mean * products[:, 0], products[:, 1], mean**2
     few = _FEW * float(mass.mean())

@@ -120,9 +120,10 @@ def _fit(
     along, across = kernel * math.sqrt(elongation), kernel / math.sqrt(elongation)
     fits = np.zeros((*lattice.shape, N_STEERED))
     for part, window, row, column in windows(cells, lattice, 2.0 * along):
-        rival = np.zeros(window.shape[:2])
+        n_rows, n_columns, _ = window.shape
+        rival = np.zeros((n_rows, n_columns))
         a, b = cells.row - row, cells.column - column
-        inside = (a >= 0) & (a < rival.shape[0]) & (b >= 0) & (b < rival.shape[1])
+        inside = (a >= 0) & (a < n_rows) & (b >= 0) & (b < n_columns)
         rival[a[inside], b[inside]] = left_out[inside]
         fit_steered_planes(
             window, cells.cell_size, row, column, along, across, lattice.spacing,

@@ -26,8 +26,9 @@ from changedetect.kernels.bundle import point_steps, reduced_system
 from changedetect.kernels.projection import N_CALIBRATION
 from changedetect.photogrammetry.block import ImageBlock, Observations
 from changedetect.photogrammetry.covariance import PixelCorrelation, pixel_correlation
+from changedetect.photogrammetry.lens import corrected_intrinsics, intrinsics_correction
 from changedetect.photogrammetry.priors import boresight_pattern
-from changedetect.photogrammetry.triangulation import residuals, triangulate
+from changedetect.photogrammetry.triangulation import are_determined, residuals, triangulate
 from changedetect.typing import BoolArray, FloatArray
 
 __all__ = ["LENS_PARAMETERS", "Adjustment", "AdjustmentSettings", "adjust"]
@@ -60,6 +61,9 @@ class AdjustmentSettings:
         Parameters estimated, of `LENS_PARAMETERS`; the others stay as given.
     lens_std : tuple of 5 float
         How well the given lens is known: relative focal length, cx and cy in pixels, k1, k2.
+    max_share : float
+        Parameters whose standard error does not fall to this share of `lens_std` go back to the value given: what the
+        photos hardly determine takes up whatever the model lacks. Their `lens_std` enters the covariances.
     boresight_std : float, rad
         How well the mounting angles are known; 0 takes them as exact.
     rounds : int
@@ -72,6 +76,7 @@ class AdjustmentSettings:
 
     lens: tuple[str, ...] = ()
     lens_std: tuple[float, float, float, float, float] = (0.01, 10.0, 10.0, 0.05, 0.1)
+    max_share: float = 1.0
     boresight_std: float = 0.0
     rounds: int = 3
     max_error: float = 4.0
@@ -150,7 +155,8 @@ def adjust(
         Of the given poses, from `pose_information`; block diagonal over flights.
     settings : AdjustmentSettings, optional
     start : ImageBlock, optional
-        Poses to begin with, from an earlier adjustment; those given by default. Its lenses are not used.
+        Poses to begin with, from an earlier adjustment, and values of the lens parameters that are free; those given
+        by default.
     on_round : callable, optional
         Called after each round.
 
@@ -171,6 +177,10 @@ def adjust(
         # Poses that contradict the photos bend them; what then correlates is not the photos' noise
         problem.inflation = problem.correlation().design_effect
         problem.iterate()
+    if settings.lens and settings.max_share < 1 and problem.give_back_undetermined():
+        problem.iterate()
+        problem.remove_gross_errors(is_last=True)
+        problem.iterate()
     return problem.result()
 
 
@@ -189,6 +199,8 @@ class _Problem:
     boresight: FloatArray
     settings: AdjustmentSettings
     scale: float = 1.0
+    #: Lens parameters that stay as given although they are not known exactly; a mask of the unknowns.
+    considered: BoolArray | None = None
     #: Observations per independent one: what the images weigh less against the priors.
     inflation: float = 1.0
     #: Standard deviation given for each kind of observation, pixels.
@@ -204,9 +216,11 @@ class _Problem:
         settings: AdjustmentSettings,
         start: ImageBlock,
     ) -> _Problem:
-        begin = replace(start, intrinsics=block.intrinsics)
+        lens = _free_lens(block, start, settings)
+        begin = replace(start, intrinsics=corrected_intrinsics(block.intrinsics, lens))
         first = triangulate(begin, observations)
         fixed = np.isfinite(first.points[:, 0])
+        fixed[fixed] = are_determined(begin, first.points, observations)[fixed]
         kept, origin = observations.keep(fixed[observations.point], min_views=2)
         if kept.n_points == 0:
             msg = (
@@ -224,7 +238,7 @@ class _Problem:
             origin=origin,
             prior=prior,
             free=free,
-            lens=np.zeros((len(block.intrinsics), N_CALIBRATION)),
+            lens=lens,
             boresight=np.zeros((n_flights, 3)),
             settings=settings,
         )
@@ -287,12 +301,12 @@ class _Problem:
         total[: self.n_reduced] += gradient
         return whole[np.ix_(self.free, self.free)], total[self.free], weight
 
-    def matrix(self, weight: FloatArray) -> FloatArray:
-        """Normal matrix with given observation weights."""
+    def whole_matrix(self, weight: FloatArray) -> FloatArray:
+        """Normal matrix of all unknowns, adjusted or not, with given observation weights."""
         system: Any = reduced_system
         whole = self.prior.copy()
         whole[: self.n_reduced, : self.n_reduced] += system(*self.arrays(), weight, 0.0)[0]
-        return np.asarray(whole[np.ix_(self.free, self.free)])
+        return np.asarray(whole)
 
     def arrays(self) -> tuple[Any, ...]:
         b, o = self.block, self.observations
@@ -326,11 +340,11 @@ class _Problem:
         pose = step[: 6 * n].reshape(n, 6)
         lens = self.lens + step[6 * n : self.n_reduced].reshape(self.lens.shape)
         rotation = Rotation.from_rotvec(pose[:, 3:]).as_matrix() @ self.block.rotation
-        intrinsics = self.given.intrinsics.copy()
-        intrinsics[:, :2] *= np.exp(lens[:, :1])
-        intrinsics[:, 2:6] += lens[:, 1:]
         block = replace(
-            self.block, rotation=rotation, position=self.block.position + pose[:, :3], intrinsics=intrinsics
+            self.block,
+            rotation=rotation,
+            position=self.block.position + pose[:, :3],
+            intrinsics=corrected_intrinsics(self.given.intrinsics, lens),
         )
         boresight = self.boresight + step[self.n_reduced :].reshape(self.boresight.shape)
         return replace(self, block=block, points=self.points + point_step, lens=lens, boresight=boresight)
@@ -342,7 +356,9 @@ class _Problem:
         factor = self.robust_scale()
         limit = self.settings.max_error * max(factor, 0.1)
         n_views = self.settings.min_views if is_last else 2
-        kept, stays = self.observations.keep(error < limit, min_views=n_views)
+        determined = are_determined(self.block, self.points, self.observations)
+        good = (error < limit) & determined[self.observations.point]
+        kept, stays = self.observations.keep(good, min_views=n_views)
         if kept.n_points == 0:
             msg = (
                 "No point is left in agreement with the poses. Check that photos, camera file and logs belong together."
@@ -366,12 +382,52 @@ class _Problem:
                 sigma[kept.kind == kind] = np.clip(np.sqrt(square / redundancy), _MIN_SIGMA, most)
         return replace(kept, sigma=sigma)
 
+    def give_back_undetermined(self) -> bool:
+        """Set lens parameters that the photos hardly determine to the values given; say whether there are any."""
+        n = 6 * len(self.block)
+        std = np.sqrt(np.diag(self.covariance(self.weights()))[n : self.n_reduced])
+        known = np.tile(np.asarray(self.settings.lens_std), len(self.block.intrinsics))
+        poor = np.zeros(len(self.prior), dtype=bool)
+        poor[n : self.n_reduced] = std > self.settings.max_share * known
+        poor &= self.free
+        if not poor.any():
+            return False
+        names = {LENS_PARAMETERS[k % N_CALIBRATION] for k in np.flatnonzero(poor[n : self.n_reduced])}
+        logger.info("not determined by these photos, left as given: %s", ", ".join(sorted(names)))
+        self.free, self.considered = self.free & ~poor, poor
+        self.lens = np.where(poor[n : self.n_reduced].reshape(self.lens.shape), 0.0, self.lens)
+        self.block = replace(self.block, intrinsics=corrected_intrinsics(self.given.intrinsics, self.lens))
+        self.damping = 1e-8
+        return True
+
+    def covariance(self, weight: FloatArray) -> FloatArray:
+        """
+        Covariance of all unknowns, zero for those that are exact.
+
+        Notes
+        -----
+        With unknowns x adjusted and parameters c only considered, of prior covariance P and normal matrix N:
+        dx / dc = S = -N_xx^-1 N_xc, cov(x) = N_xx^-1 + S P S^T, cov(x, c) = S P (Schmidt's consider covariance).
+        """
+        whole = self.whole_matrix(weight / self.inflation)
+        out = np.zeros_like(whole)
+        x = np.flatnonzero(self.free)
+        factor = _factor(whole[np.ix_(x, x)])
+        out[np.ix_(x, x)] = cho_solve(factor, np.eye(x.size))
+        if self.considered is not None:
+            c = np.flatnonzero(self.considered)
+            prior = np.diag(1.0 / np.diag(self.prior)[c])
+            slope = -cho_solve(factor, whole[np.ix_(x, c)])
+            out[np.ix_(x, x)] += slope @ prior @ slope.T
+            out[np.ix_(x, c)] = slope @ prior
+            out[np.ix_(c, x)] = out[np.ix_(x, c)].T
+            out[np.ix_(c, c)] = prior
+        return out
+
     def result(self) -> Adjustment:
         weight = self.weights()
-        matrix = self.matrix(weight / self.inflation)
         deviation = self.deviation()
-        covariance = np.zeros((len(self.prior), len(self.prior)))
-        covariance[np.ix_(self.free, self.free)] = cho_solve(_factor(matrix), np.eye(len(matrix)))
+        covariance = self.covariance(weight)
         std = np.sqrt(np.diag(covariance))
         n = 6 * len(self.block)
         return Adjustment(
@@ -389,6 +445,12 @@ class _Problem:
             correlation=self.correlation(),
             prior_chi2=self.prior_chi2(),
         )
+
+
+def _free_lens(given: ImageBlock, start: ImageBlock, settings: AdjustmentSettings) -> FloatArray:
+    """Corrections that take the given lenses to those of the start, zero for parameters that are not free."""
+    between = intrinsics_correction(given.intrinsics, start.intrinsics)
+    return np.where([name in settings.lens for name in LENS_PARAMETERS], between, 0.0)
 
 
 def _prior(

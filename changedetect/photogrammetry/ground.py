@@ -14,7 +14,7 @@ from changedetect.photogrammetry.ties import Features
 from changedetect.photogrammetry.triangulation import triangulate
 from changedetect.typing import FloatArray, IntArray
 
-__all__ = ["estimate_ground", "fit_plane"]
+__all__ = ["estimate_ground", "fit_plane", "match_descriptors"]
 
 logger = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ def fit_plane(points: FloatArray) -> GroundPlane:
 
 def _pair_points(features: Sequence[Features], block: ImageBlock, i: int, j: int) -> FloatArray:
     """Ground points of two photos, matched without a prediction."""
-    match = _brute_force(features[i], features[j])
+    match = match_descriptors(features[i], features[j], _RATIO)
     if len(match) < MIN_MATCHES:
         return np.empty((0, 3))
     first, second = features[i].pixel[match[:, 0]], features[j].pixel[match[:, 1]]
@@ -118,8 +118,21 @@ def _pair_points(features: Sequence[Features], block: ImageBlock, i: int, j: int
     return np.asarray(points[below])
 
 
-def _brute_force(a: Features, b: Features) -> IntArray:
-    """Mutual nearest neighbours that pass the ratio test, shape (n, 2)."""
+def match_descriptors(a: Features, b: Features, ratio: float) -> IntArray:
+    """
+    Mutual nearest neighbours of two photos' features, wherever they lie.
+
+    Parameters
+    ----------
+    a, b : Features
+    ratio : float
+        Largest distance to the nearest descriptor, as a share of that to the second nearest.
+
+    Returns
+    -------
+    match : array, shape (n, 2), int64
+        Numbers of the features in both photos.
+    """
     if min(len(a), len(b)) < 2:
         return np.empty((0, 2), np.int64)
     product = a.descriptor @ b.descriptor.T
@@ -129,5 +142,5 @@ def _brute_force(a: Features, b: Features) -> IntArray:
     back = np.argmax(product, axis=0)
     product[rows, best] = -1
     second = 2 - 2 * product.max(axis=1)
-    good = (back[best] == rows) & (nearest < _RATIO**2 * second)
+    good = (back[best] == rows) & (nearest < ratio**2 * second)
     return np.column_stack([rows[good], best[good]])

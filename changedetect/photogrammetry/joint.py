@@ -23,6 +23,7 @@ __all__ = [
     "JointSettings",
     "SharedPoints",
     "compare_flights",
+    "count_shared",
     "drop_changed",
     "require_shared",
     "shared_between_flights",
@@ -211,6 +212,21 @@ def drop_changed(
     return kept, place[is_moved]
 
 
+def count_shared(block: ImageBlock, shared: Observations) -> IntArray:
+    """
+    Points that each two flights have in common, shape (n_flights, n_flights); all points of a flight on the diagonal.
+
+    Parameters
+    ----------
+    block : ImageBlock
+    shared : Observations
+        From `shared_between_flights`.
+    """
+    seen = np.zeros((shared.n_points, int(block.flight.max()) + 1), dtype=np.int64)
+    seen[shared.point, block.flight[shared.image]] = 1
+    return np.asarray(seen.T @ seen)
+
+
 def require_shared(block: ImageBlock, shared: Observations, settings: JointSettings, names: tuple[str, ...]) -> None:
     """
     Refuse flights that no chain of shared points joins.
@@ -220,9 +236,7 @@ def require_shared(block: ImageBlock, shared: Observations, settings: JointSetti
     InputDataError
     """
     n_flights = len(names)
-    seen = np.zeros((shared.n_points, n_flights), dtype=np.int64)
-    seen[shared.point, block.flight[shared.image]] = 1
-    common = seen.T @ seen
+    common = count_shared(block, shared)
     reached, frontier = {0}, [0]
     while frontier:
         g = frontier.pop()

@@ -18,11 +18,14 @@ from changedetect.typing import FloatArray
 
 __all__ = [
     "MetashapeCalibration",
+    "corrected_intrinsics",
     "from_colmap",
     "from_metashape",
     "intrinsics_array",
+    "intrinsics_correction",
     "normalise",
     "rays",
+    "reduced_camera",
     "to_colmap",
     "to_metashape",
     "with_calibration",
@@ -36,6 +39,7 @@ _COLMAP_PARAMETERS = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 
 
@@ -76,6 +80,27 @@ def intrinsics_array(camera: CameraIntrinsics) -> FloatArray:
     return np.array([c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3], dtype=np.float64)
 
 
+def corrected_intrinsics(intrinsics: FloatArray, correction: FloatArray) -> FloatArray:
+    """
+    Intrinsics moved by corrections of an adjustment.
+
+    Parameters
+    ----------
+    intrinsics : array, shape (n_lenses, 9)
+    correction : array, shape (n_lenses, 5)
+        Of log focal length, cx, cy (pixels), k1, k2.
+    """
+    moved: FloatArray = intrinsics.copy()
+    moved[:, :2] *= np.exp(correction[:, :1])
+    moved[:, 2:6] += correction[:, 1:]
+    return moved
+
+
+def intrinsics_correction(before: FloatArray, after: FloatArray) -> FloatArray:
+    """Corrections that take intrinsics to others, shape (n_lenses, 5); the inverse of `corrected_intrinsics`."""
+    return np.column_stack([np.log(after[:, 0] / before[:, 0]), after[:, 2:6] - before[:, 2:6]])
+
+
 def with_calibration(camera: CameraIntrinsics, correction: FloatArray) -> CameraIntrinsics:
     """
     Camera moved by corrections of an adjustment.
@@ -98,6 +123,32 @@ def with_calibration(camera: CameraIntrinsics, correction: FloatArray) -> Camera
     )
 
 
+def reduced_camera(camera: CameraIntrinsics, factor: int) -> CameraIntrinsics:
+    """
+    Camera of photos of which each square of `factor` x `factor` pixels became one.
+
+    Parameters
+    ----------
+    camera : CameraIntrinsics
+    factor : int
+
+    Examples
+    --------
+    >>> half = reduced_camera(CameraIntrinsics(100, 80, 90.0, 90.0, 49.5, 39.5), 2)
+    >>> half.width, half.fx, half.cx
+    (50, 45.0, 24.5)
+    """
+    return replace(
+        camera,
+        width=camera.width // factor,
+        height=camera.height // factor,
+        fx=camera.fx / factor,
+        fy=camera.fy / factor,
+        cx=(camera.cx + 0.5) / factor - 0.5,
+        cy=(camera.cy + 0.5) / factor - 0.5,
+    )
+
+
 def from_colmap(model: str, width: int, height: int, parameters: FloatArray) -> CameraIntrinsics:
     """
     Camera of a COLMAP model.
@@ -105,7 +156,7 @@ def from_colmap(model: str, width: int, height: int, parameters: FloatArray) -> 
     Parameters
     ----------
     model : str
-        SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV.
+        SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, or FULL_OPENCV without k4, k5, k6.
     width, height : int, pixels
     parameters : array
         As a line of cameras.txt gives them.
@@ -131,6 +182,10 @@ def from_colmap(model: str, width: int, height: int, parameters: FloatArray) -> 
     focal = values.pop("f", None)
     if focal is not None:
         values |= {"fx": focal, "fy": focal}
+    rational = [name for name in ("k4", "k5", "k6") if values.pop(name, 0.0) != 0.0]
+    if rational:
+        msg = f"The FULL_OPENCV camera has {', '.join(rational)}, which is not supported. Calibrate it as OPENCV."
+        raise InputDataError(msg)
     values["cx"] -= 0.5
     values["cy"] -= 0.5
     return CameraIntrinsics(width, height, **values)

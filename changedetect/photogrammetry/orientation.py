@@ -177,10 +177,11 @@ def match_flight(
     strip = np.empty(len(block), np.int64)
     for label, run in enumerate(runs):
         strip[run] = label
-    if len(runs) == len(block):
+    candidates = overlapping_pairs(block, ground, settings.ties.min_overlap)
+    if not candidates:
         msg = (
-            f"No photo overlaps the next one by a fifth ({len(block)} photos, {block.names[0]} and later). The camera "
-            "must trigger more often, or photos and logs are not of one flight."
+            f"No photo overlaps another by a tenth ({len(block)} photos, {block.names[0]} and later). The camera must "
+            "trigger more often, or photos and logs are not of one flight."
         )
         raise InputDataError(msg)
     tracks = track_features(
@@ -191,7 +192,6 @@ def match_flight(
         workers=settings.workers,
         on_photo=_counter(on_step, len(block), "tracks"),
     )
-    candidates = overlapping_pairs(block, ground, settings.ties.min_overlap)
     above = block.position[:, 2] - ground.at(block.position[:, 0], block.position[:, 1])
     pairs = match_pairs(
         features,
@@ -218,6 +218,7 @@ def orient_flight(
     matching: Matching,
     settings: OrientationSettings,
     *,
+    start: ImageBlock | None = None,
     marks: Observations | None = None,
     on_step: Step | None = None,
 ) -> Oriented:
@@ -233,6 +234,8 @@ def orient_flight(
         Of these poses.
     matching : Matching
     settings : OrientationSettings
+    start : ImageBlock, optional
+        Poses and lens to begin with, where those given are too rough; the lens is then adjusted from the beginning.
     marks : Observations, optional
         Of control points; they become the last points given to the adjustment.
     on_step : callable, optional
@@ -243,7 +246,9 @@ def orient_flight(
         Observations and poses contradict each other.
     """
     rough = AdjustmentSettings(rounds=2)
-    first = adjust(block, Observations.join([matching.tracks, matching.ties]), information, rough)
+    if start is not None:
+        rough = replace(settings.adjustment, rounds=2, boresight_std=0.0, min_views=2)
+    first = adjust(block, Observations.join([matching.tracks, matching.ties]), information, rough, start=start)
     is_track = first.origin < matching.tracks.n_points
     kept, _ = first.observations.keep(is_track[first.observations.point])
     carried = extend_tracks(
@@ -323,7 +328,7 @@ def orient_together(
     require_shared(given, shared, settings.joint, names)
     own = Observations.join([result.observations for result in oriented], [int(k) for k in offsets[:-1]])
     information = block_diag(*informations)
-    rough = AdjustmentSettings(rounds=2, boresight_std=settings.adjustment.boresight_std)
+    rough = replace(settings.adjustment, rounds=2, min_views=2)
     report = _counter(on_step, 2 + settings.adjustment.rounds, "adjustment together")
     first = adjust(given, Observations.join([own, shared]), information, rough, start=start, on_round=report)
     is_shared = first.origin >= own.n_points
@@ -350,7 +355,8 @@ def _require_matches(block: ImageBlock, tracks: Observations, ties: Observations
         msg = (
             f"Only {n_points} points are seen by three photos or more, at least {_MIN_POINTS} are needed; the poorest "
             f"photo is {poorest} with {int(per_photo.min())} observations. Photos must overlap by two thirds and show "
-            "ground with texture, not water; and logs and photos must be of one flight."
+            "ground with texture, not water; logs and photos must be of one flight, and the clock of the camera be in "
+            "time."
         )
         raise InputDataError(msg)
     lonely = np.flatnonzero(per_photo < 4)

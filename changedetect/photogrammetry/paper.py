@@ -8,9 +8,12 @@ fix, are multiplied by height over baseline. Of a track's views the first and th
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from changedetect.errors import InputDataError
+from changedetect.kernels.pose_weighted import pose_weighted_points
 from changedetect.kernels.projection import N_CALIBRATION
 from changedetect.photogrammetry.adjustment import Adjustment
 from changedetect.photogrammetry.block import ImageBlock, Observations
@@ -30,7 +33,12 @@ def two_views(tracks: Observations) -> Observations:
 
 
 def triangulated(
-    block: ImageBlock, observations: Observations, information: FloatArray, *, max_error: float = 4.0
+    block: ImageBlock,
+    observations: Observations,
+    information: FloatArray,
+    *,
+    max_error: float = 4.0,
+    heeds_poses: bool = False,
 ) -> Adjustment:
     """
     Points of poses as they are, in the shape of an adjustment that moved nothing.
@@ -43,6 +51,9 @@ def triangulated(
         Of the poses, for the points' covariance.
     max_error : float
         Points whose largest residual exceeds this many times the median are left out.
+    heeds_poses : bool
+        Weigh the views of a point by the covariance of the poses, which takes off what neighbouring photos have in
+        common, instead of taking all as equally good.
 
     Raises
     ------
@@ -65,6 +76,13 @@ def triangulated(
     size = n + N_CALIBRATION * len(block.intrinsics)
     covariance = np.zeros((size, size))
     covariance[:n, :n] = np.linalg.inv(information)
+    if heeds_poses:
+        solve: Any = pose_weighted_points
+        solved_again = solve(
+            points, block.rotation, block.position, block.intrinsics, block.lens,
+            kept.start, kept.image, kept.pixel, kept.sigma, np.ascontiguousarray(covariance[:n, :n]),
+        )  # fmt: skip
+        points = np.where(np.isfinite(solved_again[:, :1]), solved_again, points)
     n_flights = int(block.flight.max()) + 1
     lenses = np.zeros((len(block.intrinsics), N_CALIBRATION))
     width, height = block.size.mean(axis=0)

@@ -50,6 +50,8 @@ class TieSettings:
     ----------
     n_features : int
         Largest number of features in a photo.
+    contrast : float
+        Smallest response of a feature, in SIFT's measure; less finds more on fields and beaches.
     ratio : float
         Nearest over second nearest descriptor distance of an unambiguous match.
     unrelated : float
@@ -64,6 +66,7 @@ class TieSettings:
     """
 
     n_features: int = 2000
+    contrast: float = 0.04
     ratio: float = 0.8
     unrelated: float = 0.5
     max_epipolar: float = 3.0
@@ -130,7 +133,9 @@ def detect_features(
 
     def detect(image: int) -> Features:
         opencv: Any = cv2  # the stubs lack SIFT
-        detector = opencv.SIFT_create(nfeatures=settings.n_features, enable_precise_upscale=True)
+        detector = opencv.SIFT_create(
+            nfeatures=settings.n_features, contrastThreshold=settings.contrast, enable_precise_upscale=True
+        )
         keypoints, descriptors = detector.detectAndCompute(photos(image), None)
         if on_photo is not None:
             on_photo()

@@ -9,9 +9,13 @@ import numpy as np
 from changedetect.kernels.projection import project_many
 from changedetect.kernels.triangulation import triangulate as triangulate_kernel
 from changedetect.photogrammetry.block import ImageBlock, Observations
-from changedetect.typing import FloatArray
+from changedetect.typing import BoolArray, FloatArray
 
-__all__ = ["Triangulation", "observation_rays", "residuals", "triangulate", "two_view_error"]
+__all__ = ["Triangulation", "are_determined", "observation_rays", "residuals", "triangulate", "two_view_error"]
+
+
+#: Rays of a point must meet at this angle, rad: a baseline of a two-hundredth of the height.
+_MIN_ANGLE = 0.005
 
 
 @dataclass(frozen=True)
@@ -106,6 +110,29 @@ def residuals(block: ImageBlock, points: FloatArray, observations: Observations)
     out = observations.pixel - projected[:, :2]
     out[~(projected[:, 2] > 0)] = np.nan
     return np.asarray(out)
+
+
+def are_determined(block: ImageBlock, points: FloatArray, observations: Observations) -> BoolArray:
+    """
+    Which points are seen under an angle; the others run off along their rays and leave normal equations singular.
+
+    Parameters
+    ----------
+    block : ImageBlock
+    points : array, shape (n_points, 3), ENU, m
+    observations : Observations
+
+    Notes
+    -----
+    The mean of two unit vectors an angle a apart has the length cos(a / 2).
+    """
+    if observations.n_points == 0:
+        return np.zeros(0, dtype=bool)
+    rays = points[observations.point] - block.position[observations.image]
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    mean = np.add.reduceat(rays, observations.start[:-1]) / observations.n_views[:, None]
+    length = np.minimum(np.linalg.norm(mean, axis=1), 1.0)
+    return np.asarray(length < np.cos(_MIN_ANGLE / 2))
 
 
 def two_view_error(height: float, baseline: float, focal: float, sigma: float) -> float:

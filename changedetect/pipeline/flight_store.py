@@ -12,20 +12,24 @@ import json
 import logging
 import zipfile
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from changedetect.errors import ModelStateError
+from changedetect.navigation.frame import LocalFrame
 from changedetect.photogrammetry.adjustment import Adjustment
+from changedetect.photogrammetry.anchored import FinishedFlight
 from changedetect.photogrammetry.block import GroundPlane, ImageBlock, Observations
 from changedetect.photogrammetry.covariance import PixelCorrelation
 from changedetect.photogrammetry.orientation import Matching, Oriented
+from changedetect.photogrammetry.rough import RoughOrientation
 from changedetect.photogrammetry.ties import Features, PairMatches
 from changedetect.storage import atomic_path
 
-__all__ = ["FlightStore", "key_of"]
+__all__ = ["FlightStore", "key_of", "load_finished", "save_finished"]
 
 logger = logging.getLogger(__name__)
 
@@ -89,6 +93,31 @@ class FlightStore:
         parts = zip(np.split(found["pixel"], cuts), np.split(found["raw"], cuts), strict=True)
         return [Features(pixel, raw) for pixel, raw in parts]
 
+    def save_rough(self, key: str, rough: RoughOrientation) -> None:
+        """Keep a rough orientation."""
+        arrays = {
+            "given_rotation": rough.given.rotation,
+            "rotation": rough.start.rotation,
+            "position": rough.start.position,
+            "intrinsics": rough.start.intrinsics,
+            "is_turned": rough.is_turned,
+            "is_joined": rough.is_joined,
+            "ground_height": np.array(rough.ground_height),
+            "n_pairs": np.array([rough.n_pairs, rough.n_tried]),
+        }
+        self._save("rough", key, arrays)
+
+    def load_rough(self, key: str, stated: ImageBlock) -> RoughOrientation | None:
+        """Rough orientation of a block kept under this key; None where there is none."""
+        found = self._load("rough", key)
+        if found is None:
+            return None
+        given = replace(stated, rotation=found["given_rotation"])
+        start = replace(stated, rotation=found["rotation"], position=found["position"], intrinsics=found["intrinsics"])
+        n_pairs, n_tried = (int(n) for n in found["n_pairs"])
+        height = float(found["ground_height"])
+        return RoughOrientation(given, start, found["is_turned"], found["is_joined"], height, n_pairs, n_tried)
+
     def save_matching(self, key: str, matching: Matching) -> None:
         """Keep tracks and ties."""
         g, pairs = matching.ground, matching.pairs
@@ -114,36 +143,15 @@ class FlightStore:
 
     def save_oriented(self, key: str, oriented: Oriented) -> None:
         """Keep an adjustment."""
-        a = oriented.adjustment
-        arrays = {name: getattr(a, name) for name in _ADJUSTMENT_ARRAYS}
-        arrays |= {
-            "rotation": a.block.rotation,
-            "position": a.block.position,
-            "intrinsics": a.block.intrinsics,
-            "correlation": np.vstack([a.correlation.distance, a.correlation.correlation]),
-            "design_effect": np.array(a.correlation.design_effect),
-            "prior_chi2": np.array(a.prior_chi2),
-        }
-        packed = _pack("kept", a.observations) | _pack("given", oriented.observations)
-        self._save("adjustment", key, arrays | packed)
+        arrays = _adjustment_arrays(oriented.adjustment)
+        self._save("adjustment", key, arrays | _pack("given", oriented.observations))
 
     def load_oriented(self, key: str, given: ImageBlock) -> Oriented | None:
         """Adjustment of a block kept under this key; None where there is none."""
         found = self._load("adjustment", key)
         if found is None:
             return None
-        block = ImageBlock(
-            given.names, found["rotation"], found["position"], found["intrinsics"], given.size, given.lens, given.flight
-        )
-        distance, correlation = found["correlation"]
-        adjustment = Adjustment(
-            block=block,
-            observations=_unpack("kept", found),
-            correlation=PixelCorrelation(distance, correlation, float(found["design_effect"])),
-            prior_chi2=float(found["prior_chi2"]),
-            **{name: found[name] for name in _ADJUSTMENT_ARRAYS},
-        )
-        return Oriented(adjustment, _unpack("given", found))
+        return Oriented(_adjustment_from(found, given), _unpack("given", found))
 
     def _save(self, name: str, key: str, arrays: Mapping[str, np.ndarray[Any, Any]]) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -165,6 +173,76 @@ class FlightStore:
             return None
         logger.info("%s: kept from an earlier run", path)
         return found
+
+
+def save_finished(path: Path, flight: FinishedFlight) -> None:
+    """Write the final adjustment of a flight, with all that later flights need to be adjusted to it."""
+    block, origin = flight.adjustment.block, flight.origin
+    arrays = _adjustment_arrays(flight.adjustment) | {
+        "names": np.array(block.names),
+        "size": block.size,
+        "lens": block.lens,
+        "flight": block.flight,
+        "origin": np.array([origin.latitude, origin.longitude, origin.height]),
+        "format": np.array(_FORMAT),
+        "bound_to": np.array(list(flight.cross), dtype=np.str_),
+    }
+    arrays |= {f"cross_{k}": values for k, values in enumerate(flight.cross.values())}
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, **arrays)
+
+
+def load_finished(path: Path) -> FinishedFlight:
+    """
+    Read what `save_finished` wrote.
+
+    Raises
+    ------
+    ModelStateError
+        The file is missing, damaged, or of another version.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            found = {entry: stored[entry] for entry in stored.files}
+        if int(found["format"]) != _FORMAT:
+            msg = f"'{path}' is of format {int(found['format'])}, this version of changedetect reads {_FORMAT}."
+            raise ModelStateError(msg)
+        names = tuple(str(name) for name in found["names"])
+        poses = found["rotation"], found["position"], found["intrinsics"]
+        given = ImageBlock(names, *poses, found["size"], found["lens"], found["flight"])
+        latitude, longitude, height = (float(v) for v in found["origin"])
+        cross = {str(name): found[f"cross_{k}"] for k, name in enumerate(found["bound_to"])}
+        return FinishedFlight(_adjustment_from(found, given), LocalFrame(latitude, longitude, height), cross)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        msg = f"'{path}' cannot be read ({error}). `changedetect update` makes it anew once the folder is removed."
+        raise ModelStateError(msg) from error
+
+
+def _adjustment_arrays(a: Adjustment) -> dict[str, np.ndarray[Any, Any]]:
+    arrays: dict[str, np.ndarray[Any, Any]] = {name: getattr(a, name) for name in _ADJUSTMENT_ARRAYS}
+    arrays |= {
+        "rotation": a.block.rotation,
+        "position": a.block.position,
+        "intrinsics": a.block.intrinsics,
+        "correlation": np.vstack([a.correlation.distance, a.correlation.correlation]),
+        "design_effect": np.array(a.correlation.design_effect),
+        "prior_chi2": np.array(a.prior_chi2),
+    }
+    return arrays | _pack("kept", a.observations)
+
+
+def _adjustment_from(found: Mapping[str, np.ndarray[Any, Any]], given: ImageBlock) -> Adjustment:
+    block = ImageBlock(
+        given.names, found["rotation"], found["position"], found["intrinsics"], given.size, given.lens, given.flight
+    )
+    distance, correlation = found["correlation"]
+    return Adjustment(
+        block=block,
+        observations=_unpack("kept", found),
+        correlation=PixelCorrelation(distance, correlation, float(found["design_effect"])),
+        prior_chi2=float(found["prior_chi2"]),
+        **{name: found[name] for name in _ADJUSTMENT_ARRAYS},
+    )
 
 
 def _pack(name: str, observations: Observations) -> dict[str, np.ndarray[Any, Any]]:

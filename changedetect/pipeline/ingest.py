@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
-from changedetect.catalogue import Epoch, Programme, Source, validate_epoch_id
-from changedetect.errors import InputDataError, MissingInputError, OutputExistsError
+from changedetect.catalogue import Epoch, Programme, Source, parse_date, validate_epoch_id
+from changedetect.errors import ConfigError, InputDataError, MissingInputError, OutputExistsError
+from changedetect.pipeline.flight_inputs import is_flight_folder
 from changedetect.pipeline.lock import programme_lock
 from changedetect.pipeline.reading import read_epoch_points
 from changedetect.pipeline.regions import describe_region, regions_overlap
@@ -32,9 +33,11 @@ class AddedEpoch:
     ----------
     epoch : Epoch
     n_points : int
-        Observations inside the programme's bounds.
+        Observations inside the programme's bounds; 0 for a flight, whose points `update` makes.
+    n_photos : int
+        Of a flight; 0 for files of points.
     region : tuple (west, east, south, north), m
-        Ground they cover.
+        Ground they cover; of a flight, that below the photos' centres.
     is_late : bool
         Whether later epochs exist, which are learned again after this one.
     """
@@ -43,13 +46,14 @@ class AddedEpoch:
     n_points: int
     region: Region
     is_late: bool
+    n_photos: int = 0
 
 
 def add_epoch(
     programme: Programme,
     epoch_id: str,
     sources: Sequence[Source],
-    date: datetime,
+    date: datetime | None,
     *,
     label: str = "",
     move: bool = False,
@@ -59,13 +63,17 @@ def add_epoch(
     """
     Read and check the sources of a new epoch, and write `epochs/EPOCH_ID.toml`.
 
+    A folder that holds a flight is one source, and the only one of its epoch: its logs are navigated and its photos
+    checked here, its points are made by `update`.
+
     Parameters
     ----------
     programme : Programme
     epoch_id : str
     sources : sequence of Source
         `uri` as the user gave it, relative to the working directory.
-    date : datetime
+    date : datetime, optional
+        When it was surveyed. By default what the flight itself says, else the epoch id.
     label : str
     move : bool
         Move the files into the programme's folder `sources/EPOCH_ID/`, last of all.
@@ -88,9 +96,12 @@ def add_epoch(
         As their names say.
     """
     validate_epoch_id(epoch_id)
+    if _is_flight(sources, move=move):
+        return _add_flight(programme, epoch_id, sources[0], date, label=label, overwrite=overwrite, dry_run=dry_run)
+    if date is None:
+        date = parse_date(epoch_id, "no --date is given, and the epoch id")
     if programme.epoch_path(epoch_id).exists() and not overwrite:
-        msg = f"Epoch '{epoch_id}' exists. Choose another id, or pass --overwrite to replace it."
-        raise OutputExistsError(msg)
+        raise OutputExistsError(_exists(epoch_id))
     if dry_run:
         return _check(programme, epoch_id, sources, date, label)
     with programme_lock(programme.directory):
@@ -123,7 +134,10 @@ def _described(programme: Programme, source: Source) -> Source:
     """Return the source with its checksum, its path as the programme is to remember it."""
     path = Path(source.uri).expanduser().resolve()
     if path.is_dir():
-        msg = f"'{source.uri}' is a folder. Name the files in it, for example {source.uri}/*.laz."
+        msg = (
+            f"'{source.uri}' is a folder. Name the files in it, for example {source.uri}/*.laz. (The folder of a "
+            "flight holds photos, and imu.csv and gps.csv or a PX4 log.)"
+        )
         raise InputDataError(msg)
     sha256 = sha256_of_file(path)
     home = programme.directory.resolve()
@@ -149,6 +163,66 @@ def _require_new_files(programme: Programme, epoch_id: str, sources: Sequence[So
         known[checksum] = f"this epoch, as '{source.name}'"
 
 
+def _is_flight(sources: Sequence[Source], *, move: bool) -> bool:
+    """Whether the sources are one flight; refuses flights beside others, and options that mean nothing for them."""
+    flights = [source for source in sources if is_flight_folder(Path(source.uri).expanduser())]
+    if not flights:
+        return False
+    if len(sources) > 1:
+        msg = (
+            f"'{flights[0].uri}' is a flight; a flight is an epoch of its own. Add it by itself, and the other sources "
+            "as other epochs."
+        )
+        raise InputDataError(msg)
+    if move:
+        msg = f"'{flights[0].uri}' is a flight: flights are referenced where they lie. Leave --move out."
+        raise ConfigError(msg)
+    plain = Source(uri=flights[0].uri)
+    if flights[0].reading_options() != plain.reading_options():
+        msg = (
+            f"'{flights[0].uri}' is a flight: --crs, --sigma, --classes, --columns, --nodata and --band are about "
+            "files of points. Leave them out; what a flight needs stands in its site.json and camera.yaml."
+        )
+        raise ConfigError(msg)
+    return True
+
+
+def _add_flight(
+    programme: Programme,
+    epoch_id: str,
+    source: Source,
+    date: datetime | None,
+    *,
+    label: str,
+    overwrite: bool,
+    dry_run: bool,
+) -> AddedEpoch:
+    """Navigate a flight, check its photos, and remember its files by their checksums."""
+    from changedetect.pipeline.flight_checks import check_flight  # photogrammetry, which files of points do not need
+
+    if programme.epoch_path(epoch_id).exists() and not overwrite:
+        raise OutputExistsError(_exists(epoch_id))
+    checked = check_flight(programme, source, epoch_id, date)
+    _require_new_files(programme, epoch_id, (checked.source,))
+    _require_overlap(programme, epoch_id, checked.region)
+    epoch = Epoch(epoch_id=epoch_id, date=checked.date, sources=(checked.source,), label=label, region=checked.region)
+    ordered = programme.with_epoch(epoch)
+    if not dry_run:
+        with programme_lock(programme.directory):
+            programme.write_epoch(epoch)
+    return AddedEpoch(
+        epoch=epoch,
+        n_points=0,
+        n_photos=checked.source.n_photos or 0,
+        region=checked.region,
+        is_late=ordered[-1].epoch_id != epoch_id,
+    )
+
+
+def _exists(epoch_id: str) -> str:
+    return f"Epoch '{epoch_id}' exists. Choose another id, or pass --overwrite to replace it."
+
+
 def _known_checksums(programme: Programme, epoch: Epoch) -> list[str]:
     """Checksums pinned in the epoch's file, or else those found when it was learned, or else those on disk."""
     if all(source.sha256 for source in epoch.sources):
@@ -158,6 +232,8 @@ def _known_checksums(programme: Programme, epoch: Epoch) -> list[str]:
         return [source.sha256 for source in record.sources]
     checksums = []
     for source in epoch.sources:
+        if source.is_flight:
+            continue
         try:
             checksums.append(sha256_of_file(source.path(programme.directory)))
         except MissingInputError as error:

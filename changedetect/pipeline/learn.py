@@ -122,7 +122,10 @@ def learn_epoch(
     learned = learned or _learn_points(programme, epoch, parent, reference_id, models)
     _write_state(programme, epoch, parent, learned)
     models.put(epoch.epoch_id, learned.model)
-    ratio = learned.model.stated_sigma_ratio() if isinstance(learned.model, LWPRSurface) else None
+    ratio, settings = None, None
+    if isinstance(learned.model, LWPRSurface):
+        ratio, settings = learned.model.stated_sigma_ratio(), learned.model.chosen_settings()
+        logger.info("%s: chosen from the density: %s.", epoch.epoch_id, _in_words(settings))
     if ratio is not None:
         logger.info("%s: the noise found is %.2f times the stated sigma.", epoch.epoch_id, ratio)
     return {
@@ -130,10 +133,15 @@ def learn_epoch(
         "n_points": learned.n_points,
         "origin": learned.origin,
         "sigma_ratio": ratio,
+        "settings": settings,
         "alignment": None if learned.alignment is None else asdict(learned.alignment),
         "warnings": [] if learned.alignment is None else list(learned.alignment.warnings),
         "sources": [{"uri": item.uri, "sha256": item.sha256, "n_used": item.n_used} for item in learned.sources],
     }
+
+
+def _in_words(settings: dict[str, float]) -> str:
+    return ", ".join(f"{name.removesuffix('_m')} {value:.3g} m" for name, value in settings.items())
 
 
 def _learn_points(
@@ -158,7 +166,8 @@ def _rebuild(
     programme: Programme, epoch: Epoch, parent: Epoch | None, reference_id: str | None, models: ModelShelf
 ) -> _Learned | None:
     """Put the epoch's stored model on its new parent; None where the sources have to be read."""
-    if own_state_reasons(programme, epoch, reference_id):
+    points = programme.reconstruction_record(epoch.epoch_id) if epoch.flight is not None else None
+    if own_state_reasons(programme, epoch, reference_id, points and points[1]):
         return None
     found = programme.state_record(epoch.epoch_id)
     try:

@@ -12,23 +12,33 @@ from changedetect.differencing import (
     ChangeMaps,
     ChangeObjects,
     CoherentTerm,
+    ObjectSize,
     TooLittleGroundError,
+    describe_resolution,
     difference_models,
     find_objects_of_change,
+    object_sizes,
+    resolution_classes,
     summarise,
 )
 from changedetect.io.zones import covered_cells, read_zones
+from changedetect.pipeline.common_errors import common_terms, errors_between
 from changedetect.pipeline.rasters import predict_layers, product_grid
 from changedetect.pipeline.regions import join_regions
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
     from changedetect.catalogue import Programme
+    from changedetect.coregistration import Alignment
     from changedetect.grid import Grid
     from changedetect.models.base import SurfaceModel
     from changedetect.pipeline.learn import ModelShelf
-    from changedetect.typing import BoolArray, JSONObject
+    from changedetect.typing import BoolArray, FloatArray, JSONObject
 
-__all__ = ["PairDifference", "difference_pair"]
+__all__ = ["PairDifference", "alignment_terms", "difference_pair", "stable_cells"]
 
 logger = logging.getLogger(__name__)
 
@@ -44,13 +54,18 @@ class PairDifference:
     maps : ChangeMaps
     objects : ChangeObjects
         At a false discovery rate of one less the programme's confidence.
+    sizes : dict of an object's number to ObjectSize
+    resolution_class : array, shape (n_rows, n_cols), uint8
+        As `resolution_classes` gives it.
     summary : dict
-        As `summarise` gives it.
+        As `summarise` gives it, and `resolution` as `describe_resolution` does.
     """
 
     grid: Grid
     maps: ChangeMaps
     objects: ChangeObjects
+    sizes: dict[int, ObjectSize]
+    resolution_class: NDArray[np.uint8]
     summary: JSONObject
 
 
@@ -79,17 +94,21 @@ def difference_pair(programme: Programme, earlier: str, later: str, models: Mode
     grid = product_grid(config, join_regions(first.region, second.region))
     terms = _alignment_terms(programme, (earlier, later), first, grid)
     try:
-        stable = _stable_cells(programme, grid)
+        stable = stable_cells(programme, grid)
         maps = difference_models(first, second, grid, config.differencing, stable=stable, coherent=terms)
     except TooLittleGroundError as error:
         logger.warning("%s to %s: %s; unchanged ground is found instead", earlier, later, error)
         maps = difference_models(first, second, grid, config.differencing, coherent=terms)
     confidence = config.differencing.confidence
     objects = find_objects_of_change(maps, grid.resolution, confidence, 1.0 - confidence)
-    return PairDifference(grid, maps, objects, summarise(maps, grid, objects, confidence))
+    sizes = object_sizes(objects, maps.dod, maps.resolution.width, grid.resolution)
+    classes = resolution_classes(maps.resolution, objects, sizes)
+    summary = summarise(maps, grid, objects, confidence)
+    summary["resolution"] = describe_resolution(maps.resolution, classes, sizes, grid.resolution)
+    return PairDifference(grid, maps, objects, sizes, classes, summary)
 
 
-def _stable_cells(programme: Programme, grid: Grid) -> BoolArray | None:
+def stable_cells(programme: Programme, grid: Grid) -> BoolArray | None:
     """Cells in the programme's stable areas; None where it names none."""
     areas = programme.stable_areas_path
     if areas is None:
@@ -106,7 +125,34 @@ def _stable_cells(programme: Programme, grid: Grid) -> BoolArray | None:
 def _alignment_terms(
     programme: Programme, epoch_ids: tuple[str, str], surface: SurfaceModel, grid: Grid
 ) -> list[CoherentTerm]:
-    """Errors of the transforms that moved the epochs; ground that the earlier epoch did not see counts as level."""
+    """Errors that whole epochs share and the other has not; ground that the earlier did not see counts as level."""
+    errors = errors_between(programme, *epoch_ids)
+    return common_terms(errors, predict_layers(surface, grid)["elevation"], grid) if errors else []
+
+
+def alignment_terms(
+    programme: Programme, epoch_ids: Sequence[str], elevation: FloatArray, grid: Grid
+) -> list[CoherentTerm]:
+    """
+    Errors of the transforms that moved epochs to the programme's first.
+
+    Parameters
+    ----------
+    programme : Programme
+    epoch_ids : sequence of str
+        Those that were not moved have none.
+    elevation : array, shape (n_rows, n_cols), m
+        Terrain; where it is NaN the ground counts as level.
+    grid : Grid
+
+    Returns
+    -------
+    terms : list of CoherentTerm
+    """
+    return _terms(_applied_alignments(programme, epoch_ids), elevation, grid)
+
+
+def _applied_alignments(programme: Programme, epoch_ids: Sequence[str]) -> list[Alignment]:
     applied = []
     for epoch_id in epoch_ids:
         found = programme.state_record(epoch_id)
@@ -114,9 +160,10 @@ def _alignment_terms(
         alignment = None if record is None else record.applied()
         if alignment is not None:
             applied.append(alignment)
-    if not applied:
-        return []
-    elevation = predict_layers(surface, grid)["elevation"]
+    return applied
+
+
+def _terms(applied: Sequence[Alignment], elevation: FloatArray, grid: Grid) -> list[CoherentTerm]:
     steep_north, steep_east = (
         np.gradient(elevation, -grid.resolution, grid.resolution)
         if min(grid.shape) > 1

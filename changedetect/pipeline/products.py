@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import changedetect
 from changedetect.catalogue import ChangeProduct, ProductRecord, Programme, describe_files
@@ -25,6 +27,7 @@ from changedetect.pipeline.learn import ModelShelf
 from changedetect.pipeline.manifest import utc_now
 from changedetect.pipeline.pairs import difference_pair
 from changedetect.pipeline.rasters import predict_layers, product_grid
+from changedetect.pipeline.stac import write_item
 from changedetect.storage import read_json, write_json
 from changedetect.typing import JSONObject
 
@@ -72,7 +75,7 @@ def make_epoch_products(
     model = models.get(epoch_id)
     grid = product_grid(config, model.region)
     layers = predict_layers(model, grid)
-    limits = programme_limits(programme, (epoch_id,)) or surface_limits(layers)
+    limits = programme_limits(programme, (epoch_id,), surface_limits(layers))
     meta = SurfaceMetadata(
         programme=config.name,
         run_id=run_id,
@@ -82,7 +85,9 @@ def make_epoch_products(
         epoch=epoch_id,
         datetime=epoch.date.isoformat(),
     )
-    add_manifest = _manifest_writer(programme, (epoch_id,), grid, run_id, limits=limits, warnings=())
+    add_manifest = _manifest_writer(
+        programme, (epoch_id,), grid, run_id, limits=limits, warnings=(), is_listed=directory is None
+    )
     folder = programme.product_directory(epoch_id) if directory is None else directory
     files = write_epoch_products(folder, layers, grid, meta, add_files=add_manifest)
     observed = float(np.mean(np.isfinite(layers["elevation"])))
@@ -121,8 +126,13 @@ def make_pair_products(
         "warnings": list(warnings),
         **statistics,
     }
-    layers = {name: getattr(maps, _MAP_NAMES.get(name, name)) for name in CHANGE_LAYERS}
-    limits = programme_limits(programme, (pair.earlier, pair.later)) or change_limits(maps)
+    layers: dict[str, NDArray[Any]] = {
+        "resolution": maps.resolution.width,
+        "unresolved_std": maps.resolution.unresolved_std,
+        "resolution_class": difference.resolution_class,
+    }
+    layers |= {name: getattr(maps, _MAP_NAMES.get(name, name)) for name in CHANGE_LAYERS if name not in layers}
+    limits = programme_limits(programme, (pair.earlier, pair.later), change_limits(maps))
     meta = ChangeMetadata(
         programme=config.name,
         run_id=run_id,
@@ -137,11 +147,18 @@ def make_pair_products(
         change_threshold=config.differencing.change_threshold_m,
     )
     add_manifest = _manifest_writer(
-        programme, (pair.earlier, pair.later), grid, run_id, limits=limits, warnings=warnings
+        programme,
+        (pair.earlier, pair.later),
+        grid,
+        run_id,
+        limits=limits,
+        warnings=warnings,
+        is_listed=directory is None,
     )
 
     def add_files(folder: Path) -> None:
-        write_objects(folder / OBJECTS_FILE, objects, grid, epochs=(pair.earlier, pair.later))
+        epoch_ids = (pair.earlier, pair.later)
+        write_objects(folder / OBJECTS_FILE, objects, grid, epochs=epoch_ids, sizes=difference.sizes)
         write_json(folder / SUMMARY_FILE, summary)
         add_manifest(folder)
 
@@ -183,12 +200,15 @@ def _manifest_writer(
     *,
     limits: Mapping[str, tuple[float, float]],
     warnings: tuple[str, ...],
+    is_listed: bool,
 ) -> Callable[[Path], None]:
-    """Return what adds the manifest to a folder of products, last of its files."""
+    """Return what adds item and manifest to a folder of products, last of its files."""
     config = programme.config
     states = {epoch_id: _state_sha256(programme, epoch_id) for epoch_id in epoch_ids}
 
     def write(folder: Path) -> None:
+        created = utc_now()
+        write_item(folder, programme, epoch_ids, grid, run_id, created, is_listed=is_listed)
         ProductRecord(
             epochs=epoch_ids,
             states=states,
@@ -200,7 +220,7 @@ def _manifest_writer(
             files=describe_files(folder),
             software_version=changedetect.__version__,
             run_id=run_id,
-            created=utc_now(),
+            created=created,
         ).write(folder)
 
     return write

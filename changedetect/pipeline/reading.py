@@ -6,8 +6,8 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from changedetect.catalogue import Epoch, Programme, Source, SourceRecord
-from changedetect.errors import InputDataError
+from changedetect.catalogue import POINTS_FOLDER, Epoch, Programme, Source, SourceRecord
+from changedetect.errors import InputDataError, ModelStateError
 from changedetect.io.points import SourceOptions, iter_programme_chunks, open_points
 from changedetect.pipeline.regions import describe_region, join_regions
 from changedetect.pointcloud import PointCloud, check_count
@@ -48,7 +48,11 @@ def read_epoch_points(programme: Programme, epoch: Epoch) -> EpochPoints:
         A source has changed since it was added, cannot be used, or too few points remain.
     CRSMismatchError, VerticalDatumError
         A source's CRS is not known or cannot be brought to the programme's.
+    ModelStateError
+        The epoch's flight has not been reconstructed.
     """
+    if epoch.flight is not None:
+        return _read_flight_points(programme, epoch, epoch.flight)
     read = [read_source(programme, source) for source in epoch.sources]
     clouds = [cloud for cloud, _ in read]
     _require_same_sigma(epoch.sources, clouds)
@@ -103,6 +107,36 @@ def read_source(programme: Programme, source: Source) -> tuple[PointCloud, Sourc
         crs=opened.crs,
     )
     return cloud, record
+
+
+def _read_flight_points(programme: Programme, epoch: Epoch, source: Source) -> EpochPoints:
+    """Points that `update` made from a flight, as one source: the flight itself."""
+    folder = programme.flight_directory(epoch.epoch_id) / POINTS_FOLDER
+    found = programme.reconstruction_record(epoch.epoch_id)
+    if found is None:
+        msg = (
+            f"The flight of epoch '{epoch.epoch_id}' has not been reconstructed. Run: changedetect update "
+            f"{programme.directory}"
+        )
+        raise ModelStateError(msg)
+    record, manifest_sha256 = found
+    name = next(name for name in record.files if name.endswith(".laz"))
+    opened = open_points(folder / name, SourceOptions(crs=programme.config.crs))
+    cloud = PointCloud.concatenate([_inside(chunk, programme.config.bounds) for chunk in opened.iter_chunks()])
+    check_count(len(cloud), f"epoch {epoch.epoch_id}")
+    logger.info("%s: %d of %d points used", folder / name, len(cloud), record.n_points)
+    read = SourceRecord(
+        uri=source.uri,
+        sha256=record.source_sha256,
+        size=int(record.files[name]["size"]),
+        modified_ns=0,
+        options=source.reading_options(),
+        n_read=record.n_points,
+        n_used=len(cloud),
+        crs=record.crs,
+        derived_sha256=manifest_sha256,
+    )
+    return EpochPoints(cloud, (read,))
 
 
 def _options(source: Source) -> SourceOptions:

@@ -6,7 +6,7 @@ import json
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,21 @@ from changedetect.photogrammetry.control import ControlPoint
 from changedetect.photogrammetry.covariance import PointUncertainty, flight_difference, point_uncertainty
 from changedetect.photogrammetry.dense import DensePoints, dense_points
 from changedetect.photogrammetry.orientation import OrientationSettings, OrientedTogether, Step, orient_together
-from changedetect.pipeline.flight_run import METHODS, FlightRun, default_workers, read_flight_source
+from changedetect.pipeline.flight_run import (
+    METHODS,
+    FlightRun,
+    FlightSource,
+    default_workers,
+    read_flight_source,
+)
 from changedetect.pipeline.flight_store import FlightStore
+from changedetect.pipeline.photo_clock import with_camera_in_time
 from changedetect.pipeline.queries import require_absent
 from changedetect.pointcloud import PointCloud
 from changedetect.storage import write_json
 from changedetect.typing import FloatArray, IntArray, JSONObject
 
-__all__ = ["FlightPoints", "ReconstructOptions", "output_crs", "reconstruct"]
+__all__ = ["FlightPoints", "ReconstructOptions", "output_crs", "reconstruct", "warn_of_contradiction", "write_flight"]
 
 logger = logging.getLogger(__name__)
 
@@ -52,8 +59,8 @@ class ReconstructOptions:
     ----------
     crs : str, optional
         Of the points; by default what site.json states, else the UTM zone with heights above the ellipsoid.
-    method : str
-        One of `METHODS`.
+    method : str, optional
+        One of `METHODS`; by default poses that another program adjusted are taken as given, all others are adjusted.
     calibrate : bool
         Estimate the lens parameters and mounting angles that the photos determine.
     dense : bool
@@ -69,7 +76,7 @@ class ReconstructOptions:
     """
 
     crs: str | None = None
-    method: str = "adjusted"
+    method: str | None = None
     calibrate: bool = False
     dense: bool = False
     work: Path | None = None
@@ -134,20 +141,21 @@ def reconstruct(
     files = _output_files(directories, output)
     for path in files:
         require_absent(path, overwrite=options.overwrite)
-    if options.dense and options.method != "adjusted":
+    if options.dense and options.method not in (None, "adjusted", "given"):
         msg = f"Dense points need adjusted poses; leave out --dense or --method {options.method}."
         raise ConfigError(msg)
-    if (options.control or options.checks) and (options.method != "adjusted" or len(directories) > 1):
+    if (options.control or options.checks) and (options.method not in (None, "adjusted") or len(directories) > 1):
         msg = "Control points need one flight and adjusted poses; leave out --gcp and --check, or the other flights."
         raise ConfigError(msg)
     if options.checks and not options.control:
         msg = "Check points (--check) need control points (--gcp): without them only the GPS places the flight."
         raise ConfigError(msg)
-    if options.method not in METHODS:
+    if options.method not in (None, *METHODS):
         msg = f"Unknown method {options.method!r}. Choose of {', '.join(METHODS)}."
         raise ValueError(msg)
     began = time.perf_counter()
     runs = _runs(directories, files, output, options, on_step)
+    options = replace(options, method=_method(runs, options))
     crs = output_crs(directories[0], runs[0].origin, options.crs)
     report: JSONObject = {
         "method": options.method,
@@ -160,15 +168,14 @@ def reconstruct(
     if options.dry_run:
         report["flights"] = [_describe_source(run, file) for run, file in zip(runs, files, strict=True)]
         return report
+    if options.method == "adjusted":
+        folders = zip(runs, directories, strict=True)
+        runs = [with_camera_in_time(run, path, camera_file=options.camera_file) for run, path in folders]
     together, parts = _oriented(runs, options)
     for run, (adjustment, _) in zip(runs, parts, strict=True):
-        _warn_of_contradiction(run, adjustment)
+        warn_of_contradiction(run, adjustment)
     for run, file, (adjustment, chosen) in zip(runs, files, parts, strict=True):
-        points = _points(run, adjustment, chosen, crs, options)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        extra = {"n_views": (points.n_views.astype(np.uint8), "photos the point was seen in")}
-        write_points(file, points.cloud, crs, extra=extra)
-        described = _describe_source(run, file) | _describe_result(run, adjustment, chosen, points)
+        _, described = write_flight(run, file, adjustment, chosen, crs, options)
         report["flights"].append(described)
         if options.method == "adjusted":
             _adjusted_poses(run, adjustment).save(run.store.directory / "adjusted_poses.nc")
@@ -180,6 +187,38 @@ def reconstruct(
     report["seconds"] = round(time.perf_counter() - began, 1)
     write_json(_report_file(output, len(runs)), report)
     return report
+
+
+def write_flight(
+    run: FlightRun, file: Path, adjustment: Adjustment, chosen: IntArray, crs: str, options: ReconstructOptions
+) -> tuple[FlightPoints, JSONObject]:
+    """
+    Write the points of an adjusted flight.
+
+    Parameters
+    ----------
+    run : FlightRun
+    file : path
+        LAS or LAZ.
+    adjustment : Adjustment
+    chosen : array of int
+        Numbers of the flight's points.
+    crs : str
+        Of the points.
+    options : ReconstructOptions
+        `dense` counts.
+
+    Returns
+    -------
+    points : FlightPoints
+    described : dict
+        For a report.
+    """
+    points = _points(run, adjustment, chosen, crs, options)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    extra = {"n_views": (points.n_views.astype(np.uint8), "photos the point was seen in")}
+    write_points(file, points.cloud, crs, extra=extra)
+    return points, _describe_source(run, file) | _describe_result(run, adjustment, chosen, points)
 
 
 def output_crs(directory: Path, origin: LocalFrame, stated: str | None) -> str:
@@ -242,18 +281,42 @@ def _runs(
         step = on_step
         if on_step is not None and len(directories) > 1:
             step = _named(on_step, file.stem)
-        control = _control(options, source.poses.origin)
+        control = _control(options, source)
         runs.append(FlightRun(source, store, settings, origin, step, control))
     return runs
 
 
-def _control(options: ReconstructOptions, origin: LocalFrame) -> tuple[ControlPoint, ...]:
-    """Surveyed points, those used first."""
+def _method(runs: Sequence[FlightRun], options: ReconstructOptions) -> str:
+    """Method asked for, or what suits the sources; refuses one that a source has nothing for."""
+    known = [run for run in runs if run.source.is_known]
+    photos = [run for run in runs if run.source.has_heading is not None]
+    method = options.method
+    if method is None:
+        is_given = len(known) == len(runs) == 1 and options.control is None
+        return "given" if is_given else "adjusted"
+    if method in ("smoothed", "paper") and (known or photos):
+        msg = (
+            f"--method {method} needs the logs of a flight; {[*known, *photos][0].source.label} has none (imu.csv, "
+            "gps.csv). Use --method adjusted."
+        )
+        raise ConfigError(msg)
+    if method == "given" and len(known) < len(runs):
+        lacking = next(run for run in runs if not run.source.is_known)
+        msg = (
+            f"--method given needs poses of another program (COLMAP, OpenSfM); {lacking.source.label} has none. Use "
+            "--method adjusted."
+        )
+        raise ConfigError(msg)
+    return method
+
+
+def _control(options: ReconstructOptions, source: FlightSource) -> tuple[ControlPoint, ...]:
+    """Surveyed points, those used first, their marks in pixels of the photos as they are read."""
     points: list[ControlPoint] = []
     for path, is_check in ((options.control, False), (options.checks, True)):
         if path is not None:
-            points += read_control_points(path, origin, is_check=is_check)
-    return tuple(points)
+            points += read_control_points(path, source.poses.origin, is_check=is_check)
+    return tuple(replace(point, pixel=(point.pixel + 0.5) / source.reduction - 0.5) for point in points)
 
 
 def _named(on_step: Step, name: str) -> Step:
@@ -267,7 +330,7 @@ def _oriented(
     runs: list[FlightRun], options: ReconstructOptions
 ) -> tuple[OrientedTogether | None, list[tuple[Adjustment, IntArray]]]:
     """Adjustment and numbers of the points of every flight."""
-    if options.method != "adjusted":
+    if options.method is not None and options.method != "adjusted":
         results = [run.unadjusted(options.method) for run in runs]
         return None, [(result, np.arange(len(result.points))) for result in results]
     if options.calibrate:
@@ -307,7 +370,8 @@ def _points(
 def _dense(run: FlightRun, adjustment: Adjustment, chosen: IntArray) -> DensePoints:
     mine = _images_of(run, adjustment)
     observations = adjustment.observations
-    sigma = float(np.median(observations.sigma[observations.kind == TRACK]))
+    is_track = observations.kind == TRACK
+    sigma = float(np.median(observations.sigma[is_track if is_track.any() else slice(None)]))
 
     def on_tile(done: int, total: int) -> None:
         if run.on_step is not None:
@@ -324,7 +388,8 @@ def _dense(run: FlightRun, adjustment: Adjustment, chosen: IntArray) -> DensePoi
     )
 
 
-def _warn_of_contradiction(run: FlightRun, adjustment: Adjustment) -> None:
+def warn_of_contradiction(run: FlightRun, adjustment: Adjustment) -> None:
+    """Warn where adjusted poses deviate from navigation by more than its covariance allows."""
     if adjustment.prior_chi2 > _MAX_PRIOR_CHI2:
         logger.warning(
             "%s: photos and navigation contradict each other (squared deviation of the poses %.1f times what their "

@@ -15,9 +15,11 @@ from changedetect.catalogue import (
     Epoch,
     Item,
     Programme,
+    anchors_of,
     epoch_product_reasons,
     pair_reasons,
     plan,
+    reconstruction_reasons,
     state_reasons,
     wanted_pairs,
 )
@@ -25,6 +27,7 @@ from changedetect.pipeline.learn import ModelShelf, learn_epoch
 from changedetect.pipeline.lock import programme_lock
 from changedetect.pipeline.manifest import RunManifest
 from changedetect.pipeline.products import make_epoch_products, make_pair_products
+from changedetect.pipeline.stac import is_catalogue_current, write_catalogue
 
 __all__ = ["Progress", "UpdateResult", "update"]
 
@@ -95,6 +98,9 @@ def update(
     """
     items = plan(programme)
     if not any(item.is_due for item in items):
+        if not is_catalogue_current(programme):
+            with programme_lock(programme.directory):
+                write_catalogue(programme)
         return UpdateResult(items=items)
     _use_workers(programme.config.machine.workers)
     with programme_lock(programme.directory):
@@ -123,23 +129,61 @@ class _Update:
         self._on_progress = on_progress
         self._total = total
         self._states: dict[str, str] = {}
+        self._flights: dict[str, str] = {}
 
     def execute(self) -> None:
-        """Make what is due: the model and the maps of each epoch in order of time, then the differences."""
+        """Make what is due: points, model and maps of each epoch in order of time, then the differences."""
         parent: Epoch | None = None
         for epoch in self.programme.epochs:
+            if not self._has_points(epoch):
+                continue
             # the maps follow at once, while the model's receptive fields are in memory; the next epoch needs them too
             if self._is_learned(epoch, parent):
                 parent = epoch
                 self._make_epoch_products(epoch.epoch_id)
         for pair in wanted_pairs(self.programme, list(self._states)):
             self._make_pair_products(pair)
+        write_catalogue(self.programme)
         if self._on_progress is not None:
             self._on_progress(self._total, self._total, "done")
 
+    def _has_points(self, epoch: Epoch) -> bool:
+        """Make points from an epoch's flight if that is due; one that fails is passed over."""
+        if epoch.flight is None:
+            return True
+        reasons = reconstruction_reasons(self.programme, epoch, self._flights)
+        if reasons:
+            from changedetect.pipeline.flight_epoch import reconstruct_epoch  # photogrammetry, which few updates need
+
+            item = Item("flight", epoch.epoch_id, reasons)
+            with self._step(item) as details:
+                anchors = anchors_of(self.programme, list(self._flights))
+                on_step = self._substeps(item)
+                details.update(reconstruct_epoch(self.programme, epoch, anchors, on_step=on_step))
+                for warning in details["warnings"]:
+                    self.run.warn(f"{epoch.epoch_id}: {warning}")
+            if self.run.steps[-1]["status"] == "failed":
+                return False
+        record = self.programme.reconstruction_record(epoch.epoch_id)
+        if record is None:
+            return False
+        self._flights[epoch.epoch_id] = record[1]
+        return True
+
+    def _substeps(self, item: Item) -> Progress | None:
+        """Progress of a long step, told in the label."""
+        if self._on_progress is None:
+            return None
+        on_progress, done = self._on_progress, len(self.run.steps)
+
+        def on_step(count: int, total: int, label: str) -> None:
+            on_progress(done, max(self._total, done + 1), f"{item.title}: {label} {count}/{total}")
+
+        return on_step
+
     def _is_learned(self, epoch: Epoch, parent: Epoch | None) -> bool:
         """Learn an epoch if it is due; one that fails is passed over, and the next follows its predecessor."""
-        reasons = state_reasons(self.programme, epoch, parent, self._states)
+        reasons = state_reasons(self.programme, epoch, parent, self._states, self._flights.get(epoch.epoch_id))
         if reasons:
             with self._step(Item("model", epoch.epoch_id, reasons)) as details:
                 reference_id = next(iter(self._states), None)

@@ -9,14 +9,20 @@ from typing import Literal
 
 from changedetect.catalogue import (
     MANIFEST_FILE,
+    POINTS_FOLDER,
+    STEPS_FOLDER,
     Epoch,
     ProductRecord,
     Programme,
+    ReconstructionRecord,
+    Source,
     StateRecord,
     damaged_files,
     plan,
 )
 from changedetect.errors import MissingInputError, ModelStateError
+from changedetect.pipeline.flight_inputs import check_files
+from changedetect.pipeline.stac import catalogue_findings
 from changedetect.storage import sha256_of_file
 
 __all__ = ["Finding", "verify"]
@@ -43,7 +49,7 @@ class Finding:
 
 def verify(programme: Programme) -> tuple[Finding, ...]:
     """
-    Check checksums of sources, models and products, lineage, and that products match their inputs.
+    Check checksums of sources, models and products, lineage, that products match their inputs and the catalogue them.
 
     Parameters
     ----------
@@ -54,7 +60,7 @@ def verify(programme: Programme) -> tuple[Finding, ...]:
     findings : tuple of Finding
         Empty where all is well.
     """
-    found = (*_sources(programme), *_folders(programme), *_currency(programme))
+    found = (*_sources(programme), *_folders(programme), *_currency(programme), *_catalogue(programme))
     return tuple(dict.fromkeys(found))  # a damaged folder is found both by itself and as stale
 
 
@@ -63,6 +69,9 @@ def _sources(programme: Programme) -> Iterator[Finding]:
         recorded = _recorded_checksums(programme, epoch)
         for source, expected in zip(epoch.sources, recorded, strict=True):
             subject = f"epochs/{epoch.epoch_id}.toml"
+            if source.is_flight:
+                yield from _flight(programme, source, subject)
+                continue
             try:
                 path = source.path(programme.directory)
                 actual = sha256_of_file(path)
@@ -71,6 +80,20 @@ def _sources(programme: Programme) -> Iterator[Finding]:
                 continue
             if expected is not None and actual != expected:
                 yield Finding("error", subject, f"source '{path}' differs from its checksum")
+
+
+def _flight(programme: Programme, source: Source, subject: str) -> Iterator[Finding]:
+    """Every file of a flight against its checksum."""
+    try:
+        path = source.path(programme.directory)
+    except MissingInputError as error:
+        yield Finding("warning", subject, f"flight {source.name} is not there: {error}")
+        return
+    if not path.is_dir():
+        yield Finding("warning", subject, f"flight {source.name} is not there: no folder {path}")
+        return
+    for complaint in check_files(path, source):
+        yield Finding("error", subject, f"flight '{path}': {complaint}")
 
 
 def _recorded_checksums(programme: Programme, epoch: Epoch) -> list[str | None]:
@@ -98,9 +121,21 @@ def _folders(programme: Programme) -> Iterator[Finding]:
             if folder.name not in known:
                 yield Finding("warning", subject, "belongs to no epoch of the programme; remove it")
             yield from _folder(folder, owner, subject)
+    flights = [epoch.epoch_id for epoch in programme.epochs if epoch.flight is not None]
+    for folder in sorted(path for path in (programme.directory / "flights").glob("*") if path.is_dir()):
+        subject = f"flights/{folder.name}"
+        if folder.name not in flights:
+            yield Finding("warning", subject, "belongs to no flight of the programme; remove it")
+        if (folder / POINTS_FOLDER).is_dir():
+            yield from _folder(folder / POINTS_FOLDER, ReconstructionRecord, f"{subject}/{POINTS_FOLDER}")
+        for path in sorted(folder.iterdir()):
+            if path.name not in (POINTS_FOLDER, STEPS_FOLDER):
+                yield Finding("warning", subject, f"{path.name} was not written by changedetect")
 
 
-def _folder(folder: Path, owner: type[StateRecord | ProductRecord], subject: str) -> Iterator[Finding]:
+def _folder(
+    folder: Path, owner: type[StateRecord | ProductRecord | ReconstructionRecord], subject: str
+) -> Iterator[Finding]:
     try:
         found = owner.read(folder)
     except ModelStateError as error:
@@ -118,9 +153,15 @@ def _folder(folder: Path, owner: type[StateRecord | ProductRecord], subject: str
 
 def _currency(programme: Programme) -> Iterator[Finding]:
     """Lineage: models against sources, settings and parents; products against models and settings."""
-    folders = {"model": "state", "epoch": "products", "pair": "products"}
+    folders = {"flight": "flights", "model": "state", "epoch": "products", "pair": "products"}
     for item in plan(programme):
         folder = Path(folders[item.kind]) / item.item_id
         for reason in item.reasons:
             exists = (programme.directory / folder).is_dir()
             yield Finding("error" if exists else "warning", folder.as_posix(), reason)
+
+
+def _catalogue(programme: Programme) -> Iterator[Finding]:
+    """STAC collection, catalogue and items against what is there."""
+    for subject, message in catalogue_findings(programme):
+        yield Finding("error", subject, message)

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from changedetect.differencing import AreaBudget, area_budget, elevation_bands
+from changedetect.errors import InputDataError
+from changedetect.io.geopackage import write_zone_budgets
 from changedetect.io.zones import covered_cells, read_zones
 from changedetect.pipeline.learn import ModelShelf
 from changedetect.pipeline.pairs import difference_pair
@@ -56,7 +58,7 @@ def measure_volumes(
     band_height : float, m, optional
         Height of bands of elevation that get a budget each.
     output : Path, optional
-        CSV file to write, one row a budget.
+        CSV file to write, one row a budget, or GeoPackage (``.gpkg``) of the zones with their budgets.
     overwrite : bool
     dry_run : bool
         Check everything and measure nothing.
@@ -75,6 +77,9 @@ def measure_volumes(
         The output exists.
     """
     if output is not None:
+        if output.suffix.lower() == ".gpkg" and zones is None:
+            msg = f"'{output}' is to hold zones with their budgets, but no zones are named; add them, or write a .csv."
+            raise InputDataError(msg)
         require_absent(output, overwrite=overwrite)
     config = programme.config
     programme.pair(earlier, later)
@@ -103,7 +108,10 @@ def measure_volumes(
         "warnings": warnings,
     }
     if output is not None:
-        _write_table(output, details)
+        if output.suffix.lower() == ".gpkg":
+            write_zone_budgets(output, listed, budgets, config.crs, epochs=(earlier, later))
+        else:
+            _write_table(output, details)
         details["output"] = str(output)
     return details
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from changedetect.catalogue import Programme, validate_epoch_id
 from changedetect.errors import OutputError
 from changedetect.pipeline.lock import programme_lock
+from changedetect.pipeline.stac import write_catalogue
 
 __all__ = ["WithdrawnEpoch", "withdraw_epoch"]
 
@@ -83,6 +84,7 @@ def withdraw_epoch(programme: Programme, epoch_id: str, *, dry_run: bool = False
         except OSError as error:
             msg = f"Epoch '{epoch_id}' cannot be taken out wholly: {error}. Mend that and withdraw it again."
             raise OutputError(msg) from error
+        write_catalogue(Programme(programme.directory, programme.loaded))  # which does not know the epoch any more
     return plan
 
 
@@ -90,7 +92,8 @@ def _described(programme: Programme, epoch_id: str) -> WithdrawnEpoch:
     kept_as = programme.directory / "withdrawn" / f"{epoch_id}.toml"
     others = [epoch.epoch_id for epoch in programme.epochs if epoch.epoch_id != epoch_id]
     names = [epoch_id, *(f"{epoch_id}_{other}" for other in others), *(f"{other}_{epoch_id}" for other in others)]
-    folders = [programme.state_directory(epoch_id), *(programme.product_directory(name) for name in names)]
+    folders = [programme.flight_directory(epoch_id), programme.state_directory(epoch_id)]
+    folders += [*(programme.product_directory(name) for name in names)]
     removed = tuple(folder for folder in folders if folder.is_dir())
     n_later = 0
     if programme.epoch_path(epoch_id).exists() or not (kept_as.exists() and removed):

@@ -1,11 +1,13 @@
 """
 Errors of differences: false positives and power, area means, volumes, objects, real surveys held out, cost.
 
-Run: python tests/benchmarks/change_statistics.py points|dem|means|volumes|real|cost [--seeds N] [--scenes scenes.py]
+Run: python tests/benchmarks/change_statistics.py chain|points|dem|means|volumes|real|cost [--seeds N]
+[--scenes scenes.py] [--cases corr:9,het:9] [--plain]
 
-`points` and `dem` take the two scenes of a file that gives `point_epoch`, `change`, `dem_pair`; what the file displaces
-the later epoch by is taken out, so that only the statistics of the errors are tested. `means` and `volumes` draw
-differences with known errors. `real` reads the surveys under CHANGEDETECT_DATA.
+`points` and `dem` take the two scenes of a file that gives `point_epoch`, `ground`, `change`, `dem_pair`; what the file
+displaces the later epoch by is taken out, so that only the statistics of the errors are tested. `chain` leaves it in
+and aligns by the package's own means. `means` and `volumes` draw differences with known errors. `--plain` predicts no
+errors. `real` reads the surveys under CHANGEDETECT_DATA.
 """
 
 import argparse
@@ -26,15 +28,18 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).res
 from error_fields import change_maps, evidence, quiet, smooth_field  # noqa: E402
 
 from changedetect.config import DifferencingConfig  # noqa: E402
-from changedetect.differencing import area_budget, difference_models, find_objects_of_change, sum_std  # noqa: E402
+from changedetect.coregistration import ModelReference, align  # noqa: E402
+from changedetect.differencing import CoherentTerm, area_budget, difference_models, find_objects_of_change, sum_std  # noqa: E402
 from changedetect.differencing.clusters import normal_score  # noqa: E402
 from changedetect.differencing.covariates import error_covariates  # noqa: E402
 from changedetect.differencing.error_model import estimate_errors  # noqa: E402
 from changedetect.differencing.error_scale import half_width_scale  # noqa: E402
 from changedetect.differencing.maps import judge_change  # noqa: E402
 from changedetect.differencing.pair import _adaptive_evidence, cell_errors  # noqa: E402
+from changedetect.differencing.prediction import predict_errors  # noqa: E402
 from changedetect.grid import Grid  # noqa: E402
 from changedetect.models.lwpr import LWPRSurface  # noqa: E402
+from changedetect.pointcloud import PointCloud  # noqa: E402
 
 DATA = Path(os.environ.get("CHANGEDETECT_DATA", "../shared/data"))
 SETTINGS = DifferencingConfig()
@@ -97,6 +102,53 @@ def points(scenes, n_seeds, densities):
                 maps = difference_models(*models, grid, SETTINGS)
                 results.append(score(maps, truth, 0.5, MARGIN[density]))
             report(f"points {case:4s} {density:g}/m2, {n_seeds} seeds", results)
+
+
+def epochs(scenes, case, density, seed):
+    """Points of both epochs: the file's cases, and noise that grows with slope, or a fifth of the ground missing."""
+    clouds = []
+    for s, is_later in ((1000 + 2 * seed, False), (1001 + 2 * seed, True)):
+        p = scenes.point_epoch(int(density * 1e4), s, later=is_later, case="corr" if case == "corr" else "iid")
+        rng = np.random.default_rng([s, 3])
+        if case == "het":
+            step = 0.05
+            ahead = scenes.ground(p[:, 0] + step, p[:, 1]), scenes.ground(p[:, 0], p[:, 1] + step)
+            slope = np.hypot(*(a - scenes.ground(p[:, 0], p[:, 1]) for a in ahead)) / step
+            p[:, 2] += rng.normal(0.0, 0.05, len(p)) * np.sqrt((1.0 + 3.0 * np.clip(slope, 0.0, 1.0)) ** 2 - 1.0)
+        if case == "gappy":
+            gone = np.zeros(len(p), bool)
+            for x, y, radius in zip(*rng.uniform(0.0, 100.0, (2, 60)), rng.uniform(1.0, 5.0, 60), strict=True):
+                gone |= np.hypot(p[:, 0] - x, p[:, 1] - y) < radius
+            p = p[~gone]
+        clouds.append(PointCloud(*(np.ascontiguousarray(c) for c in p.T)))
+    return clouds
+
+
+def whole_chain(scenes, n_seeds, cases, first_seed=0, size=100.0):
+    """Alignment by the package's own means, nothing handed over; then the difference with the alignment's errors."""
+    grid = Grid.from_region((0.0, size, 0.0, 100.0), 0.5, "EPSG:32632")
+    easting, northing = grid.coordinates()
+    truth = scenes.change(easting, northing).reshape(grid.shape)
+    for case, density in cases:
+        results, misses, predicted = [], [], 0
+        for seed in range(first_seed, first_seed + n_seeds):
+            earlier, later = (cloud.select(cloud.easting < size + 3.0) for cloud in epochs(scenes, case, density, seed))
+            first = LWPRSurface(resolution=0.25).fit(earlier.coordinates, earlier.elevation)
+            alignment = align(later, ModelReference(first, first.own_kernel_))
+            later = alignment.apply(later)
+            second = LWPRSurface(resolution=0.25).fit(later.coordinates, later.elevation)
+            elevation = np.nan_to_num(first.predict(grid.coordinates()).elevation.reshape(grid.shape))
+            north, east = np.gradient(elevation, -0.5, 0.5)
+            design = alignment.offset_design(easting, northing, east.ravel(), north.ravel(), elevation.ravel())
+            terms = (CoherentTerm(design, alignment.covariance),)
+            maps = difference_models(first, second, grid, SETTINGS, coherent=terms)
+            predicted += maps.errors.prediction is not None
+            results.append(score(maps, truth, 0.5, MARGIN[density]))
+            print(f"   seed {seed}: false positives {100 * results[-1][0]:.1f} %", file=sys.stderr, flush=True)
+            misses.append(alignment.transform.shift + np.array([0.03, -0.02, 0.01]) * (case == "corr"))
+        rms = 100.0 * np.sqrt(np.mean(np.square(misses), axis=0))
+        report(f"chain {case:5s} {density:g}/m2, {n_seeds} seeds, {size:g} x 100 m, {predicted} predicted", results)
+        print(f"      alignment: rms error east {rms[0]:.2f}, north {rms[1]:.2f}, up {rms[2]:.2f} cm", flush=True)
 
 
 def dem(scenes_path, n_seeds, cells):
@@ -216,7 +268,7 @@ def beach():
 
 
 def held_out(name, found, ground, transects, side=40):
-    """Fit on every second block, judge the others; a robust offset is taken off first."""
+    """Fit on every second block, judge the others, predicted from those or not; a robust offset is taken off first."""
     known = found.known & (ground if transects is not None else True)
     offset = half_width_scale(found.difference[known])[0]
     if transects is not None:
@@ -225,30 +277,43 @@ def held_out(name, found, ground, transects, side=40):
     variance = np.where(known, found.variance, 0.0)
     reach = found.correlation_length / math.sqrt(2.0 * math.pi)
     covariates = error_covariates(variance, found.counts, found.terrain, known, reach)
+    noise = math.exp(float(np.median(covariates["noise"][known])))
     _, stable = estimate_errors(d, variance, covariates, 1.0, reach)
     rows, cols = np.mgrid[: d.shape[0], : d.shape[1]]
     block = ((rows // side) + (cols // side)) % 2
-    z, g = np.full(d.shape, np.nan), np.full(d.shape, np.nan)
+    plain, corrected, freedom = (np.full(d.shape, np.nan) for _ in range(3))
+    is_predicted = np.zeros(2, bool)
+    ratio = []
     for k in (0, 1):
         held = (block == k) & known
-        model, _ = estimate_errors(np.where(held, np.nan, d), np.where(held, 0.0, variance), covariates, 1.0, reach)
-        total = np.sqrt(variance + model.correlated_variance(covariates, d.shape))
-        z[held] = d[held] / total[held]
-        g[held] = normal_score(z[held], model.scale.freedom)
+        model, kept = estimate_errors(np.where(held, np.nan, d), np.where(held, 0.0, variance), covariates, 1.0, reach)
+        s2 = model.correlated_variance(covariates, d.shape)
+        ratio.append(float(np.sqrt(np.median(s2[held]))) / noise)
+        plain[held] = d[held] / np.sqrt(variance + s2)[held]
+        freedom[held] = model.scale.freedom
+        # the held-out blocks are predicted from the others
+        prediction = predict_errors(d, (variance, s2), model, kept & ~held, 1.0, noise=noise)
+        if prediction is None:
+            corrected[held] = plain[held]
+        else:
+            corrected[held] = ((d - prediction.error) / np.sqrt(variance + prediction.variance))[held]
+            is_predicted[k] = True
     before = np.where(known, d / np.sqrt(np.where(known, variance, 1.0)), np.nan)
     grounds = {"found stable": stable & known}
     grounds["away from shores" if transects is None else "transects"] = known & (
         ground if transects is None else transects
     )
-    print(f"{name} (offset {offset:+.3f} m)")
+    print(
+        f"{name} (offset {offset:+.3f} m, errors over noise {ratio[0]:.1f} and {ratio[1]:.1f}, "
+        f"halves predicted: {is_predicted.sum()})"
+    )
     for label, where in grounds.items():
-        print(
-            f"   {label:17s} {where.sum():7d} cells  independent errors alone: robust sd of z "
-            f"{1.4826 * np.median(np.abs(before[where])):.2f}, "
-            f"flagged {100 * np.mean(np.abs(before[where]) > 1.96):.0f} %"
-            f"  held out: robust sd of z {1.4826 * np.median(np.abs(z[where])):.2f}, flagged "
-            f"{100 * np.mean(np.abs(g[where]) > 1.96):.1f} %"
-        )
+        print(f"   {label:17s} {where.sum():7d} cells", end="")
+        for title, z in (("independent alone", before), ("held out", plain), ("predicted", corrected)):
+            spread = 1.4826 * np.median(np.abs(z[where]))
+            flagged = np.mean(np.abs(normal_score(z[where], freedom[where] if z is not before else math.inf)) > 1.96)
+            print(f"  {title}: robust sd of z {spread:.2f}, flagged {100 * flagged:.1f} %", end="")
+        print()
     sys.stdout.flush()
 
 
@@ -258,7 +323,7 @@ def cost():
     shape = (2000, 2000)
     found = evidence(quiet(1, shape) + smooth_field(rng, shape, 0.05, 30.0), 0.01)
     before, start, wall = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time(), time.time()
-    errors = cell_errors(found, 1.0)
+    errors = cell_errors(found, 1.0, predict=True)
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     cpu, wall = time.process_time() - start, time.time() - wall
     print(f"error model 2000 x 2000: {cpu:.1f} s CPU, {wall:.1f} s wall, {used / 1024:.0f} MB more")
@@ -275,14 +340,24 @@ def cost():
 def main() -> None:
     """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=["points", "dem", "means", "volumes", "real", "cost"])
+    parser.add_argument("part", choices=["chain", "points", "dem", "means", "volumes", "real", "cost"])
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--scenes", default="../shared/scenes.py")
     parser.add_argument("--densities", default="100,9,2.5")
     parser.add_argument("--cells", type=int, default=2000)
+    parser.add_argument("--cases", default="corr:9,het:9,iid:9,iid:2.5,gappy:9")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--size", type=float, default=100.0, help="width of the ground, m")
+    parser.add_argument("--plain", action="store_true", help="do not predict errors")
     options = parser.parse_args()
+    if options.plain:
+        global SETTINGS  # noqa: PLW0603
+        SETTINGS = DifferencingConfig(predict_errors=False)
     if options.part == "points":
         points(load_scenes(options.scenes), options.seeds, [float(v) for v in options.densities.split(",")])
+    elif options.part == "chain":
+        cases = [(c.split(":")[0], float(c.split(":")[1])) for c in options.cases.split(",")]
+        whole_chain(load_scenes(options.scenes), options.seeds, cases, options.first_seed, options.size)
     elif options.part == "dem":
         dem(options.scenes, options.seeds, options.cells)
     elif options.part == "means":

@@ -6,13 +6,17 @@ ties found for the smoothed poses), and a point for every cell of a fine grid on
 together and differenced, point against local plane. NMAD of heights on open ground after removing offset and tilt;
 `+shift` removes a horizontal shift too (the GPS is a metre or two off, and ground slopes).
 
-Run: CHANGEDETECT_DATA=DIR python tests/benchmarks/flights.py [--work DIR] [--workers 2]
+`--pycolmap` runs pycolmap (pip install pycolmap) on the first epoch beside the front-end, both from nothing, with the
+same number of threads; `--programme` takes both flights through `init`, `add`, `add`, `update` and judges the maps.
+
+Run: CHANGEDETECT_DATA=DIR python tests/benchmarks/flights.py [--work DIR] [--workers 2] [--pycolmap] [--programme]
 """
 
 import argparse
 import csv
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -27,11 +31,16 @@ from scipy.spatial import cKDTree
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from changedetect.cli import main as changedetect_main
 from changedetect.crs import make_transform
+from changedetect.io.camera_file import read_camera_file
+from changedetect.io.cog import read_cog
 from changedetect.navigation.frame import LocalFrame
+from changedetect.pipeline.flight_store import load_finished
 from changedetect.pipeline.reconstruct import ReconstructOptions, reconstruct
 
 DATA = Path(os.environ.get("CHANGEDETECT_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")) / "flight_sim"
+CRS = "EPSG:32756+4979"
 ORIGIN = LocalFrame(-33.89, 151.19, 40.0)
 #: Photographed by both strips, m from the origin.
 EAST, NORTH = 88.0, 36.0
@@ -169,6 +178,101 @@ def both_epochs(folder, workers):
         )
 
 
+def beside_pycolmap(folder, workers):
+    """Print time and accuracy of the whole front-end and of pycolmap, both from nothing."""
+    from pycolmap_peer import run_pycolmap
+
+    truth, flight = Truth(1), DATA / "epoch1"
+    options = ReconstructOptions(workers=workers, overwrite=True)
+    for attempt in range(2):  # the first compiles, where nothing is cached
+        start, busy = time.perf_counter(), time.process_time()
+        output = folder / f"timed_{attempt}" / "points.laz"
+        shutil.rmtree(output.parent, ignore_errors=True)
+        report = reconstruct([flight], output, options)
+        seconds, busy = time.perf_counter() - start, time.process_time() - busy
+    own, *_ = read_enu(output, report["crs"])
+    camera = read_camera_file(DATA / "camera.yaml")[0]
+    lens = [camera.fx, camera.fy, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2]
+    poses = DATA / "truth" / "poses_epoch1.csv"
+    peer, views, parts = run_pycolmap(flight, poses, lens, folder / "pycolmap", workers)
+    wall, used = (sum(part[k] for part in parts.values()) for k in (0, 1))
+    print("\nfront-end beside     points   NMAD  +shift      s   cpu s")
+    rows = [("changedetect", own, seconds, busy), ("pycolmap, >= 3 views", peer[views >= 3], wall, used)]
+    for name, points, s, cpu in rows:
+        good, error, shifted, _ = judge(truth, points)
+        print(f"{name:20s} {good.sum():6d}  {nmad(error):.3f}  {nmad(shifted):.3f}  {s:6.1f}  {cpu:6.1f}")
+    print(
+        f"pycolmap over changedetect: {wall / seconds:.1f} of wall time, {used / busy:.1f} of processor time; {parts}"
+    )
+
+
+def through_the_programme(folder, joint):
+    """Print how the change map of a programme of both flights compares with the truth."""
+    site = folder / f"site_{joint}"
+    if not site.exists():
+        for arguments in (
+            ["init", site, "--crs", CRS, "--resolution", "0.5"],
+            ["add", site, "2024-05-01", DATA / "epoch1"],
+            ["add", site, "2024-11-01", DATA / "epoch2"],
+        ):
+            _run(arguments)
+        with (site / "programme.toml").open("a") as stream:
+            stream.write(f'\n[flights]\njoint = "{joint}"\n')
+    start = time.perf_counter()
+    _run(["update", site])
+    print(f"\nprogramme, joint = {joint}: update {time.perf_counter() - start:.0f} s")
+    truth = ProgrammeTruth(site)
+    error = truth.dod - truth.change
+    stable = truth.is_open & (truth.away > 2)
+    is_flagged = np.isin(truth.change_class, (1, 2))
+    covered = np.mean(np.abs(error[truth.is_open]) < truth.lod[truth.is_open])
+    print(
+        f"  stable ground: median {np.median(error[stable]):+.3f} m, NMAD {nmad(error[stable]):.3f} m, flagged "
+        f"{100 * is_flagged[stable].mean():.1f} %; 95 % interval covers {100 * covered:.1f} % of all open ground"
+    )
+    for change, inside in truth.patches():
+        found, true = truth.dod[inside].mean(), truth.change[inside].mean()
+        share = 100 * is_flagged[inside].mean()
+        print(f"  {change['kind']:8s} mean {found:+.3f} m  truth {true:+.3f} m  cells flagged {share:.0f} %")
+
+
+def _run(arguments):
+    """Run the command line; stop where it fails."""
+    code = changedetect_main([*map(str, arguments), "--quiet"])
+    if code:
+        sys.exit(code)
+
+
+class ProgrammeTruth:
+    """Maps of the difference of both flights, and the truth where the first flight really lies."""
+
+    def __init__(self, site):
+        products = site / "products" / "2024-05-01_2024-11-01"
+        self.dod, grid, _ = read_cog(products / "dod.tif")
+        self.lod = read_cog(products / "level_of_detection.tif")[0]
+        self.change_class = read_cog(products / "change_class.tif")[0]
+        block = load_finished(site / "flights" / "2024-05-01" / "points" / "orientation.npz").adjustment.block
+        with (DATA / "truth" / "poses_epoch1.csv").open() as stream:
+            true = {row["image"]: [float(row[axis]) for axis in "xyz"] for row in csv.DictReader(stream)}
+        offset = (block.position - np.array([true[name] for name in block.names])).mean(axis=0)
+        easting, northing = grid.coordinates()
+        longitude, latitude, height = make_transform(CRS, "EPSG:4979")(easting, northing, np.full(easting.size, 40.0))
+        enu = ORIGIN.to_enu(latitude, longitude, height) - offset
+        self.east, self.north = enu[:, 0].reshape(grid.shape), enu[:, 1].reshape(grid.shape)
+        truths = [Truth(epoch) for epoch in (1, 2)]
+        self.change = truths[1].height(self.east, self.north) - truths[0].height(self.east, self.north)
+        self.is_open = np.isfinite(self.dod) & truths[0].is_open(self.east, self.north)
+        self.changes = json.loads((DATA / "truth" / "truth.json").read_text())["changes"]
+        self.away = np.min([self._beyond(change) for change in self.changes], axis=0)
+
+    def _beyond(self, change):
+        return np.hypot(self.east - change["x"], self.north - change["y"]) - change["radius"]
+
+    def patches(self):
+        """Each change and the cells inside it."""
+        return [(change, np.isfinite(self.dod) & (self._beyond(change) < 0)) for change in self.changes]
+
+
 def point_differences(earlier, later, n_neighbours=6, reach=2.5):
     """Later points minus a plane through their neighbours of the earlier epoch, its sigma, and the place."""
     first, sigma_first, _ = earlier
@@ -189,10 +293,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--work", type=Path, help="keep results here")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--pycolmap", action="store_true", help="run pycolmap beside the front-end, nothing else")
+    parser.add_argument("--programme", action="store_true", help="judge the maps of a programme, nothing else")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.work or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
+        if arguments.pycolmap:
+            beside_pycolmap(folder, arguments.workers)
+        if arguments.programme:
+            for joint in ("auto", "never"):
+                through_the_programme(folder, joint)
+        if arguments.pycolmap or arguments.programme:
+            return
         print("epoch  method    points/m2      NMAD    +shift  (east, north)    sigma  sd(z)  95 %       s  cpu s")
         for epoch in (1, 2):
             one_epoch(epoch, folder, arguments.workers)

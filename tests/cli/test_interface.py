@@ -30,7 +30,6 @@ def test_the_commands_are_those_of_the_contract():
         "init",
         "add",
         "withdraw",
-        "simulate",
         "update",
         "status",
         "verify",
@@ -38,9 +37,12 @@ def test_the_commands_are_those_of_the_contract():
         "surface",
         "diff",
         "volume",
+        "series",
         "compare",
         "reconstruct",
         "config show",
+        "simulate surveys",
+        "simulate flight",
     ]
 
 

@@ -17,6 +17,7 @@ from changedetect.errors import OutputError
 from changedetect.grid import Grid
 from changedetect.io.netcdf import (
     CHANGE_LAYERS,
+    CLASS_LAYERS,
     SURFACE_LAYERS,
     ChangeMetadata,
     SurfaceMetadata,
@@ -62,7 +63,8 @@ def change_layers(grid, seed=0):
     rng = np.random.default_rng(seed)
     layers = {name: rng.gamma(2.0, size=grid.shape) for name in CHANGE_LAYERS}
     layers["dod"] -= 2.0
-    layers["change_class"] = rng.choice(np.array([0, 1, 2, 3, 255], np.uint8), size=grid.shape)
+    for name in CLASS_LAYERS:
+        layers[name] = rng.choice(np.array([0, 1, 2, 3, 255], np.uint8), size=grid.shape)
     for array in layers.values():
         array[:3, :5] = 255 if array.dtype == np.uint8 else np.nan
     return layers
@@ -133,7 +135,7 @@ def test_layers_come_back_with_their_types_and_no_data(tmp_path):
     write_change(tmp_path / "a.nc", layers, grid, CHANGE)
     with netCDF4.Dataset(tmp_path / "a.nc") as file:
         file.set_auto_mask(False)
-        for name in set(CHANGE_LAYERS) - {"change_class"}:
+        for name in set(CHANGE_LAYERS) - set(CLASS_LAYERS):
             assert file[name].dtype == np.float32
             assert np.isnan(file[name]._FillValue)
             assert_array_equal(file[name][0], layers[name].astype(np.float32))

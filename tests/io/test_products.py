@@ -19,7 +19,7 @@ from rio_cogeo.cogeo import cog_validate
 from changedetect.errors import OutputError
 from changedetect.grid import Grid
 from changedetect.io.cog import read_cog
-from changedetect.io.netcdf import CHANGE_LAYERS, SURFACE_LAYERS
+from changedetect.io.netcdf import CHANGE_LAYERS, CLASS_LAYERS, SURFACE_LAYERS
 from changedetect.io.products import (
     CHANGE_RASTERS,
     SURFACE_RASTERS,
@@ -54,8 +54,12 @@ def change_of(grid=GRID, shift=0.0, level_of_detection=0.1):
         "change_probability": np.clip(np.abs(dod), 0, 1),
         "change_class": classes.astype(np.uint8),
         "z_score": dod / std,
+        "correlated_error": np.zeros(grid.shape),
         "n_observations_earlier": np.full(grid.shape, 5.0),
         "n_observations_later": np.full(grid.shape, 7.5),
+        "resolution": np.where(np.isnan(dod), np.nan, 3.0),
+        "unresolved_std": np.where(np.isnan(dod), np.nan, 0.2),
+        "resolution_class": np.where(np.isnan(dod), 255, 1).astype(np.uint8),
     }
 
 
@@ -83,9 +87,16 @@ def dod_stops(directory):
     return [float(item.get("value")) for item in items]
 
 
+def colours_beyond(directory, value):
+    """Colours of the stops of the change that lie further from zero than a value."""
+    items = ET.parse(directory / "dod.qml").getroot().iter("item")
+    return [item.get("color") for item in items if abs(float(item.get("value"))) > value]
+
+
 def test_pair_has_every_product_with_its_checksum(tmp_path):
     files = write_pair(tmp_path / "pair")
-    expected = {"change.nc"} | {f"{name}.{suffix}" for name in CHANGE_RASTERS for suffix in ("tif", "qml")}
+    expected = {"change.nc", "dod_significant.vrt", "dod_significant.qml"}
+    expected |= {f"{name}.{suffix}" for name in CHANGE_RASTERS for suffix in ("tif", "qml")}
     assert {file.name for file in files} == {p.name for p in (tmp_path / "pair").iterdir()} == expected
     for file in files:
         content = (tmp_path / "pair" / file.name).read_bytes()
@@ -115,7 +126,7 @@ def test_rasters_and_netcdf_of_a_pair_agree(tmp_path, crs):
             assert cog_validate(path, strict=True) == (True, [], [])
             array, grid_again, tags = read_cog(path)
             assert grid_again == grid
-            signed = np.where(array == 255, -1, array.astype(int)) if name == "change_class" else array
+            signed = np.where(array == 255, -1, array.astype(int)) if name in CLASS_LAYERS else array
             assert_array_equal(dataset[name][0], signed)
             assert_array_equal(array, change[name].astype(array.dtype))
             provenance = RUN | PAIR | {"layer": name, "confidence": "0.95"}
@@ -171,12 +182,12 @@ def test_killed_run_leaves_the_old_product(tmp_path):
         import os, signal, sys
         import numpy as np
         from changedetect.grid import Grid
-        from changedetect.io.netcdf import CHANGE_LAYERS
+        from changedetect.io.netcdf import CHANGE_LAYERS, CLASS_LAYERS
         from changedetect.io.products import ChangeMetadata, write_change_products
 
         grid = Grid(60, 80, 500000.0, 4650000.0, 0.5, "EPSG:32632+5773")
         change = {name: np.ones(grid.shape) for name in CHANGE_LAYERS}
-        change["change_class"] = np.ones(grid.shape, np.uint8)
+        change |= {name: np.ones(grid.shape, np.uint8) for name in CLASS_LAYERS}
         meta = ChangeMetadata(
             programme="demo", run_id="r2", config_sha256="", created="2024-06-01", epoch_earlier="a", epoch_later="b",
             datetime_earlier="2023-05-01", datetime_later="2024-05-01", confidence=0.95,
@@ -213,19 +224,53 @@ def test_colours_follow_the_programme_and_the_level_of_detection(tmp_path):
         values = dod_stops(tmp_path / name)
         assert (values[0], values[-1]) == (-3.0, 3.0)
         assert_allclose(sorted(values, key=abs)[:2], [-0.1, 0.1], rtol=0, atol=1e-9)
+        assert colours_beyond(tmp_path / name, 0.1) == colours_beyond(tmp_path / "a", 0.1)
         std = [float(i.get("value")) for i in ET.parse(tmp_path / name / "dod_std.qml").getroot().iter("item")]
         assert (std[0], std[-1]) == (0.0, 0.5)
 
 
-def test_colours_reach_beyond_a_level_of_detection_that_exceeds_their_limit(tmp_path, caplog):
-    write_pair(tmp_path / "pair", change_of(level_of_detection=0.5), colour_limits={"dod": (-0.3, 0.3)})
-    assert_allclose(dod_stops(tmp_path / "pair")[-1], 1.0, rtol=0, atol=1e-9)
-    assert "dod.qml reach to 1 m instead of 0.3 m" in caplog.text
+def test_colours_keep_their_meaning_where_the_level_of_detection_exceeds_their_limit(tmp_path):
+    limits = {"dod": (-0.3, 0.3)}
+    write_pair(tmp_path / "pair", change_of(level_of_detection=0.5), colour_limits=limits)
+    write_pair(tmp_path / "quiet", change_of(level_of_detection=0.05), colour_limits=limits)
+    loud, quiet = (colours_beyond(tmp_path / name, 0.5) for name in ("pair", "quiet"))
+    assert loud == ["#67001f", "#053061"]
+    ends = [item.get("color") for item in ET.parse(tmp_path / "quiet" / "dod.qml").getroot().iter("item")]
+    assert (ends[0], ends[-1]) == ("#67001f", "#053061")
+    assert quiet == []
+
+
+def test_the_neutral_band_covers_the_level_of_detection_of_nearly_all_cells(tmp_path):
+    change = change_of()
+    level = np.where(np.isnan(change["dod"]), np.nan, np.linspace(0.1, 0.15, GRID.n_cols))
+    write_pair(tmp_path / "pair", change | {"level_of_detection": level})
+    neutral = sorted(dod_stops(tmp_path / "pair"), key=abs)[1]
+    assert np.mean(level[np.isfinite(level)] <= neutral) >= 0.95
+    level[-1, 0] = level[-1, -1] = 40.0
+    write_pair(tmp_path / "pair", change | {"level_of_detection": np.where(level > 0.14, 40.0, level)})
+    assert sorted(dod_stops(tmp_path / "pair"), key=abs)[1] < 0.26
+
+
+def test_the_significant_change_is_neutral_exactly_below_the_level_of_detection(tmp_path):
+    write_pair(tmp_path / "pair")
+    with rasterio.open(tmp_path / "pair" / "dod_significant.vrt") as raster:
+        values, crs, unit = raster.read(1), raster.crs, raster.units[0]
+        assert tuple(raster.transform)[:6] == GRID.transform
+        assert np.isnan(raster.nodata)
+    with rasterio.open(tmp_path / "pair" / "dod.tif") as raster:
+        dod = raster.read(1)
+        assert (crs, unit) == (raster.crs, "m")
+    classes = read_cog(tmp_path / "pair" / "change_class.tif")[0]
+    assert_array_equal(values, np.where(np.isin(classes, (1, 2)), dod, np.where(np.isnan(dod), np.nan, 0.0)))
+    items = list(ET.parse(tmp_path / "pair" / "dod_significant.qml").getroot().iter("item"))
+    grey = [float(item.get("value")) for item in items if "below the level" in item.get("label")]
+    significant = np.abs(values[values != 0.0])
+    assert 0.0 < grey[1] < significant[np.isfinite(significant)].min()
 
 
 def test_pair_without_any_data_is_written(tmp_path):
     change = {name: np.full(GRID.shape, np.nan) for name in CHANGE_LAYERS}
-    change["change_class"] = np.full(GRID.shape, 255, np.uint8)
+    change |= {name: np.full(GRID.shape, 255, np.uint8) for name in CLASS_LAYERS}
     files = write_pair(tmp_path / "pair", change)
-    assert len(files) == 11
+    assert len(files) == 17
     assert np.isnan(read_cog(tmp_path / "pair" / "dod.tif")[0]).all()

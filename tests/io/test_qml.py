@@ -57,13 +57,24 @@ def test_changes_within_the_level_of_detection_are_neutral_and_those_beyond_are_
     def colour(value):
         return np.array([np.interp(value, values, channel) for channel in colours.T])
 
-    grey = 247 / 255
+    grey = 232 / 255
     for value in (-0.3, -0.1, 0.0, 0.1, 0.3):
         assert_allclose(colour(value), grey, rtol=0, atol=1e-9)
     for value in (-0.301, 0.301):
         assert np.ptp(colour(value)) > 0.1
     assert sum("level of detection" in label for label in labels) == 2
     assert labels[-1] == "+2 m"
+
+
+@pytest.mark.parametrize("level", [0.01, 0.2, 0.7, 1.4])
+def test_a_colour_means_the_same_change_whatever_the_level_of_detection(tmp_path, level):
+    write_diverging_style(tmp_path / "plain.qml", 1.0)
+    write_diverging_style(tmp_path / "level.qml", 1.0, level_of_detection=level)
+    plain, cut = (stops_of(tmp_path / name) for name in ("plain.qml", "level.qml"))
+    for value in (-1.6, -0.9, -0.75, -0.3, 0.3, 0.75, 0.9, 1.6):
+        if abs(value) > level:
+            seen = [[np.interp(value, v, channel) for channel in c.T] for v, c, _ in (plain, cut)]
+            assert_allclose(seen[0], seen[1], rtol=0, atol=1.5 / 255)
 
 
 def test_colours_darken_from_zero_to_both_ends(tmp_path):
@@ -124,9 +135,9 @@ def test_style_begins_with_the_document_type_qgis_writes(tmp_path):
     )
 
 
-@pytest.mark.parametrize(("limit", "level"), [(0.0, 0.0), (1.0, 1.0), (1.0, -0.1), (np.inf, 0.0), (np.nan, 0.0)])
+@pytest.mark.parametrize(("limit", "level"), [(0.0, 0.0), (-1.0, 0.0), (1.0, -0.1), (1.0, np.nan), (np.inf, 0.0)])
 def test_impossible_diverging_limits_are_refused(tmp_path, limit, level):
-    with pytest.raises(ValueError, match="0 <= level_of_detection < limit"):
+    with pytest.raises(ValueError, match="finite limit above 0"):
         write_diverging_style(tmp_path / "a.qml", limit, level_of_detection=level)
 
 
