@@ -159,13 +159,17 @@ class DifferencingConfig:
         Two-sided confidence of the level of detection and of the intervals in the summary.
     change_threshold_m : float, m
         The change whose exceedance `change_probability` states.
+    predict_errors : {"never", "stable", "always"}
+        Whether correlated errors are predicted from the unchanged ground around and taken off the difference: where
+        stable areas are named, or also from ground found not to have changed, at the price that weak change over much
+        of a map, which cannot be found, is in part taken for error.
     colour_limit_m : float or None, m
         Change that maps show in full colour; None takes what suits the first map of the programme, for all maps.
     """
 
     confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.95
     change_threshold_m: Annotated[float, Field(ge=0)] = 0.10
-    predict_errors: bool = True
+    predict_errors: Literal["never", "stable", "always"] = "stable"
     colour_limit_m: Annotated[float, Field(gt=0)] | None = None
 
 

@@ -93,7 +93,9 @@ def difference_models(
     if stable is not None and stable.shape != grid.shape:
         msg = f"stable ground has shape {stable.shape}, the grid {grid.shape}"
         raise ValueError(msg)
-    errors = cell_errors(evidence, grid.resolution, stable, coherent, predict=settings.predict_errors)
+    # ground found not to have changed may have changed too little to be found: it predicts on demand only
+    predict = settings.predict_errors == "always" or (settings.predict_errors == "stable" and stable is not None)
+    errors = cell_errors(evidence, grid.resolution, stable, coherent, predict=predict)
     return judge_change(evidence, errors, settings)
 
 

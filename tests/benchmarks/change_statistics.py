@@ -348,11 +348,11 @@ def main() -> None:
     parser.add_argument("--cases", default="corr:9,het:9,iid:9,iid:2.5,gappy:9")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--size", type=float, default=100.0, help="width of the ground, m")
-    parser.add_argument("--plain", action="store_true", help="do not predict errors")
+    parser.add_argument("--predict", action="store_true", help="predict errors from ground found not to have changed")
     options = parser.parse_args()
-    if options.plain:
+    if options.predict:
         global SETTINGS  # noqa: PLW0603
-        SETTINGS = DifferencingConfig(predict_errors=False)
+        SETTINGS = DifferencingConfig(predict_errors="always")
     if options.part == "points":
         points(load_scenes(options.scenes), options.seeds, [float(v) for v in options.densities.split(",")])
     elif options.part == "chain":
