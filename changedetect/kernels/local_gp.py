@@ -175,7 +175,8 @@ def local_processes(
                 freshest = max(freshest, found[p, 5])
             for p in range(n):
                 for q in range(p):
-                    d = math.hypot(found[p, 1] - found[q, 1], found[p, 2] - found[q, 2]) * per_l
+                    dx, dy = found[p, 1] - found[q, 1], found[p, 2] - found[q, 2]
+                    d = math.sqrt(dx * dx + dy * dy) * per_l
                     C[p, q] = (1.0 + d) * math.exp(-d)
                 C[p, p] = 1.0 + found[p, 4] * freshest / (found[p, 5] * t)
                 d = math.sqrt(found[p, 0]) * per_l
