@@ -249,9 +249,13 @@ class Programme:
         """
         times = [self.epoch(epoch_id).survey_time for epoch_id in (earlier, later)]
         if times[0] >= times[1]:
+            if times[0] > times[1]:
+                fix = f"Name them in this order: {later} {earlier}."
+            else:
+                fix = "Name two epochs of different dates."
             msg = (
                 f"A difference goes from an earlier epoch to a later one, not from '{earlier}' "
-                f"({self.epoch(earlier).date_text}) to '{later}' ({self.epoch(later).date_text})."
+                f"({self.epoch(earlier).date_text}) to '{later}' ({self.epoch(later).date_text}). {fix}"
             )
             raise InputDataError(msg)
         return ChangeProduct(earlier, later)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -19,6 +20,7 @@ __all__ = [
     "Resolution",
     "parse_classes",
     "parse_columns",
+    "parse_sigma",
 ]
 
 
@@ -57,13 +59,13 @@ def parse_classes(texts: list[str] | None) -> tuple[int, ...] | None:
     Raises
     ------
     typer.BadParameter
-        A text is no whole number.
+        A text is no whole number from 0 to 255.
     """
     if not texts:
         return None
     parts = [part.strip() for text in texts for part in text.split(",") if part.strip()]
-    if not all(part.isdecimal() for part in parts):
-        msg = f"classes are whole numbers such as 2 or 2,9; got {', '.join(texts)}"
+    if not all(part.isdecimal() and int(part) <= 255 for part in parts):
+        msg = f"classes are whole numbers from 0 to 255, such as 2 or 2,9; got {', '.join(texts)}"
         raise typer.BadParameter(msg, param_hint="--classes")
     return tuple(int(part) for part in parts)
 
@@ -71,3 +73,18 @@ def parse_classes(texts: list[str] | None) -> tuple[int, ...] | None:
 def parse_columns(text: str | None) -> tuple[str, ...] | None:
     """Read names of columns, separated by commas."""
     return None if text is None else tuple(part.strip() for part in text.split(","))
+
+
+def parse_sigma(sigma: float | None) -> float | None:
+    """
+    Check a standard deviation.
+
+    Raises
+    ------
+    typer.BadParameter
+        It is not above zero, or not finite.
+    """
+    if sigma is not None and not 0.0 < sigma < math.inf:
+        msg = f"a standard deviation is above zero, in metres, such as 0.05; got {sigma:g}"
+        raise typer.BadParameter(msg, param_hint="--sigma")
+    return sigma

@@ -17,6 +17,7 @@ from changedetect.cli.options import (
     Resolution,
     parse_classes,
     parse_columns,
+    parse_sigma,
 )
 from changedetect.cli.session import Outcome, Session, command
 
@@ -128,13 +129,16 @@ def add(
     from changedetect.catalogue import Source, parse_date, validate_epoch_id
     from changedetect.pipeline.ingest import add_epoch
 
+    if not all(sources):
+        msg = "a source is the name of a file or folder; got an empty text"
+        raise typer.BadParameter(msg, param_hint="SOURCE...")
     validate_epoch_id(epoch_id)
     moment = parse_date(date, "--date") if date else None
     listed = [
         Source(
             uri=source,
             crs=crs,
-            sigma=sigma,
+            sigma=parse_sigma(sigma),
             classes=parse_classes(classes),
             columns=parse_columns(columns),
             nodata=nodata,

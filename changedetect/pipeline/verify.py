@@ -145,7 +145,11 @@ def _folder(
         yield Finding("error", subject, f"has no {MANIFEST_FILE}; `changedetect update` makes it anew")
         return
     files = found[0].files
-    yield from (Finding("error", subject, complaint) for complaint in damaged_files(folder, files, deep=True))
+    remedy = "remove the folder, then `changedetect update` makes it anew"
+    if owner is not ProductRecord:
+        remedy += " from the sources"
+    for complaint in damaged_files(folder, files, deep=True):
+        yield Finding("error", subject, f"{complaint}; {remedy}")
     present = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     for name in sorted(present - {*files, MANIFEST_FILE}):
         yield Finding("warning", subject, f"{name} was not written by changedetect")

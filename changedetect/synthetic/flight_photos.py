@@ -35,6 +35,8 @@ __all__ = ["FlightDesign", "FlownEpoch", "fly_programme"]
 _FIELD = 1024.0 / 2050.0
 #: Beyond what the outermost photo sees on level ground, m: attitudes and relief.
 _BORDER = 16.0
+#: Longest side of a photo, pixels: the ground is drawn at the resolution of the photos, in memory.
+_MAX_SIDE = 8000
 _MOUNT = CameraMount(
     np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
     np.array([0.15, 0.02, 0.1]),
@@ -73,7 +75,7 @@ class FlightDesign:
     Raises
     ------
     ValueError
-        Too few photos or epochs, or photos too small.
+        Too few photos or epochs, or photos too small or too large.
     """
 
     n_epochs: int = 2
@@ -97,6 +99,12 @@ class FlightDesign:
             msg = (
                 f"{self.n_epochs} epochs of {self.n_strips} strips of {self.n_photos} photos of {self.size[0]} x "
                 f"{self.size[1]} pixels; at least 1, 1, 4 and 200 x 200 are needed."
+            )
+            raise ValueError(msg)
+        if max(self.size) > _MAX_SIDE:
+            msg = (
+                f"Photos of {self.size[0]} x {self.size[1]} pixels; at most {_MAX_SIDE} x {_MAX_SIDE} are rendered. "
+                "Choose a smaller size."
             )
             raise ValueError(msg)
         if not 0.0 <= self.side_overlap < 0.9:

@@ -227,6 +227,7 @@ def test_diff_writes_the_same_maps_as_update(tmp_path, site, capsys):
     np.testing.assert_array_equal(one, read_cog(site / "products" / f"{FIRST}_{SECOND}" / "dod.tif")[0])
     error = run(capsys, "diff", site, SECOND, FIRST, "-o", tmp_path / "back", expect=65)["error"]
     assert "goes from an earlier epoch to a later one" in error["message"]
+    assert f"in this order: {FIRST} {SECOND}" in error["message"]
 
 
 def test_a_model_that_is_not_current_is_used_with_a_warning(tmp_path, site, capsys):
@@ -263,6 +264,13 @@ def test_add_reads_classes_repeated_or_with_commas(tmp_path, site, capsys):
     assert run(capsys, *command, "--classes", "2,9")["n_points"] == 1200
     assert run(capsys, *command, "--classes", "2", "--classes", "9")["n_points"] == 1200
     assert "classes are whole numbers" in run(capsys, *command, "--classes", "ground", expect=2)["error"]["message"]
+    assert "from 0 to 255" in run(capsys, *command, "--classes", "300", expect=2)["error"]["message"]
+
+
+@pytest.mark.parametrize("sigma", ["-1", "0", "nan", "inf"])
+def test_add_refuses_a_sigma_that_is_none(tmp_path, site, capsys, sigma):
+    error = run(capsys, "add", site, "2024-05-05", tmp_path / "any.laz", "--sigma", sigma, expect=2)["error"]
+    assert "above zero" in error["message"]
 
 
 def test_add_refuses_an_epoch_that_exists_with_73_and_a_file_twice_with_65(tmp_path, site, capsys):
