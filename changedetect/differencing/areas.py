@@ -244,9 +244,7 @@ def area_budget(
 def _not_below_zero(raised: Quantity, lowered: Quantity) -> tuple[Quantity, Quantity]:
     """Both moved alike, so that neither is negative and their difference stays; the truth lies above zero too."""
     lift = max(0.0, -raised.value, -lowered.value)
-    lifted = [
-        Quantity(q.value + lift, q.std, max(q.lower, 0.0), max(q.upper, q.value + lift)) for q in (raised, lowered)
-    ]
+    lifted = [Quantity(q.value + lift, q.std, max(q.lower, 0.0), q.upper + lift) for q in (raised, lowered)]
     return lifted[0], lifted[1]
 
 
