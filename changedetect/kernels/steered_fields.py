@@ -28,7 +28,7 @@ __all__ = ["N_GEOMETRY", "N_STEERED", "fit_steered_planes"]
 #: 2 curvature of the level line in 1/m, 3 whether the field is steered (1 or 0).
 N_GEOMETRY = 4
 #: Columns of the answer: 0 value, 1 slope east, 2 slope north, 3 noise variance of the value, 4 effective number of
-#: observations, 5 mean square of the leave-one-out errors, 6 that of the rival.
+#: observations, 5 mean square of the leave-one-out errors (or residual variance), 6 that of the rival.
 N_STEERED = 7
 #: Ridge on slopes, in observations: keeps the plane of collinear cells defined.
 _RIDGE = 1e-2
@@ -67,7 +67,8 @@ def fit_steered_planes(
         Lattice indices of fits[0, 0].
     geometry : array, shape (n_i, n_j, N_GEOMETRY)
     rival : array, shape (n_rows, n_columns), m2
-        Squared leave-one-out error, at every cell of the window, of the surface that these fields compete with.
+        Squared leave-one-out error, at every cell of the window, of the surface that these fields compete with; of
+        shape (0, 0) if there is none: then column 5 is the residual variance, which costs no second pass.
     fits : array, shape (n_i, n_j, N_STEERED)
         Filled in place; zero where a field is not steered or has no cell at all.
 
@@ -181,6 +182,13 @@ def fit_steered_planes(
             o[2] = b1 * ey / across + b2 * ex / along
             o[3] = max(g00 * i00 + g01 * i01 + g02 * i02, 1e-3 * t0 / (s0 * s0))
             o[4] = n_effective
+            if rival.size == 0:
+                g11 = i01 * t1 + i11 * t3 + i12 * t4
+                g22 = i02 * t2 + i12 * t4 + i22 * t5
+                residual = max(zz - b0 * z0 - b1 * z1 - b2 * z2, 0.0)
+                freedom = expected - (g00 + g11 + g22)
+                o[5] = residual / max(freedom * s0 / count, 0.3 * s0)
+                continue
             # leave-one-out errors of this field and of its rival, over the same cells with the same weights
             own = other = weight = 0.0
             for a in range(a_low, a_high + 1):

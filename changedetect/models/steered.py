@@ -37,8 +37,8 @@ _CURVATURE_LIMIT = 0.5
 #: Roughness, in variances of the surface, from which a field may be steered: of one of local processes, of a pyramid,
 #: whose blur is not in its variance.
 _ROUGHNESS, _ROUGHNESS_OF_PYRAMID = 1.0, 2.0
-#: Mean square of the leave-one-out errors of long fields against that of round ones below which they are taken; against
-#: other surfaces any advantage counts.
+#: Residual variance of long fields against that of round ones below which they are taken; against leave-one-out errors
+#: of another surface any advantage counts.
 _ADVANTAGE = 0.9
 #: Standard deviation, in lattice steps, of the window over which they are compared.
 _COMPARE_REACH = 1.0
@@ -114,17 +114,19 @@ def level_lines(level: Level, kernel: float, roughness_limit: float = _ROUGHNESS
 
 
 def _fit(
-    cells: Cells, lattice: Lattice, geometry: FloatArray, kernel: float, elongation: float, left_out: FloatArray
+    cells: Cells, lattice: Lattice, geometry: FloatArray, kernel: float, elongation: float, left_out: FloatArray | None
 ) -> FloatArray:
     """Planes of the steered fields of a lattice, each of the area of a round field of this kernel."""
     along, across = kernel * math.sqrt(elongation), kernel / math.sqrt(elongation)
     fits = np.zeros((*lattice.shape, N_STEERED))
     for part, window, row, column in windows(cells, lattice, 2.0 * along):
-        n_rows, n_columns, _ = window.shape
-        rival = np.zeros((n_rows, n_columns))
-        a, b = cells.row - row, cells.column - column
-        inside = (a >= 0) & (a < n_rows) & (b >= 0) & (b < n_columns)
-        rival[a[inside], b[inside]] = left_out[inside]
+        rival = np.zeros((0, 0))
+        if left_out is not None:
+            n_rows, n_columns, _ = window.shape
+            rival = np.zeros((n_rows, n_columns))
+            a, b = cells.row - row, cells.column - column
+            inside = (a >= 0) & (a < n_rows) & (b >= 0) & (b < n_columns)
+            rival[a[inside], b[inside]] = left_out[inside]
         fit_steered_planes(
             window, cells.cell_size, row, column, along, across, lattice.spacing,
             lattice.first_row + part[0].start, lattice.first_column + part[1].start,
@@ -177,11 +179,10 @@ def steer(cells: Cells, level: Level, kernel: float, left_out: FloatArray | None
     if not (geometry[..., 3] > 0.0).any():
         return level
     cells, height = cells.centred()
-    rival = np.zeros(len(cells)) if left_out is None else left_out
-    fits = _fit(cells, level.lattice, geometry, kernel, _ELONGATION, rival)
+    fits = _fit(cells, level.lattice, geometry, kernel, _ELONGATION, left_out)
     is_long = fits[..., 4] >= N_MINIMUM
     if left_out is None:
-        round_fits = _fit(cells, level.lattice, geometry, kernel, 1.0, rival)
+        round_fits = _fit(cells, level.lattice, geometry, kernel, 1.0, None)
         limit = _ADVANTAGE * _pooled(round_fits[..., 5], round_fits[..., 4] >= N_MINIMUM)
     else:
         limit = _pooled(fits[..., 6], is_long)
