@@ -148,8 +148,10 @@ def _folder(
     remedy = "remove the folder, then `changedetect update` makes it anew"
     if owner is not ProductRecord:
         remedy += " from the sources"
+    seen_by_update = damaged_files(folder, files, deep=False)
     for complaint in damaged_files(folder, files, deep=True):
-        yield Finding("error", subject, f"{complaint}; {remedy}")
+        told = complaint if complaint in seen_by_update else f"{complaint}; {remedy}"
+        yield Finding("error", subject, told)
     present = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     for name in sorted(present - {*files, MANIFEST_FILE}):
         yield Finding("warning", subject, f"{name} was not written by changedetect")
