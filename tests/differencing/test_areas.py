@@ -37,6 +37,7 @@ def test_a_window_and_the_whole_map_give_the_same_answer():
     )
 
 
+@pytest.mark.slow
 def test_volumes_of_a_patch_are_covered_by_their_intervals_and_unbiased():
     change = np.zeros(SHAPE)
     change[50:110, 50:110] = 0.1

@@ -73,6 +73,7 @@ def test_volumes_are_those_of_the_patch():
     assert summary["systematic_offset_m"] is None
 
 
+@pytest.mark.slow
 def test_standard_deviation_of_the_net_volume_is_that_of_repeated_surveys():
     volumes, stated = [], []
     for seed in range(12):

@@ -78,6 +78,7 @@ def test_the_error_of_changed_ground_is_as_stated(drawn):
     assert 0.6 < np.sqrt(np.mean(np.square(scores))) < 1.4
 
 
+@pytest.mark.slow
 def test_change_of_two_correlated_errors_is_found_where_its_surroundings_tell(drawn):
     window = np.s_[88:106, 88:106]
     power, plain = [], []
