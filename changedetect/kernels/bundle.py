@@ -254,6 +254,34 @@ def reduced_system(
     return matrix, total
 
 
+@njit(cache=True, error_model="numpy")
+def _take_off_moved(
+    first: int,
+    last: int,
+    lens: IntArray,
+    image: IntArray,
+    weight: FloatArray,
+    by_point: FloatArray,
+    by_pose: FloatArray,
+    by_lens: FloatArray,
+    step: FloatArray,
+    base: int,
+    gradient: FloatArray,
+) -> None:
+    """Subtract W' step from a point's gradient: what its pixels move by as the camera side takes the step."""
+    for k in range(last - first):
+        i, w = image[first + k], weight[first + k]
+        at, to = 6 * i, base + N_CALIBRATION * lens[i]
+        for r in range(2):
+            moved = 0.0
+            for a in range(6):
+                moved += by_pose[k, r, a] * step[at + a]
+            for a in range(N_CALIBRATION):
+                moved += by_lens[k, r, a] * step[to + a]
+            for b in range(3):
+                gradient[b] -= w * by_point[k, r, b] * moved
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def point_steps(
     points: FloatArray,
@@ -298,17 +326,7 @@ def point_steps(
             v[a, a] *= 1.0 + damping
         if invert_symmetric(v, v_inverse) <= 0.0:
             continue
-        for k in range(last - first):
-            i, w = image[first + k], weight[first + k]
-            at, to = 6 * i, base + N_CALIBRATION * lens[i]
-            for r in range(2):
-                moved = 0.0
-                for a in range(6):
-                    moved += by_pose[k, r, a] * step[at + a]
-                for a in range(N_CALIBRATION):
-                    moved += by_lens[k, r, a] * step[to + a]
-                for b in range(3):
-                    gradient[b] -= w * by_point[k, r, b] * moved
+        _take_off_moved(first, last, lens, image, weight, by_point, by_pose, by_lens, step, base, gradient)
         for a in range(3):
             steps[p, a] = v_inverse[a, 0] * gradient[0] + v_inverse[a, 1] * gradient[1] + v_inverse[a, 2] * gradient[2]
     return steps
@@ -423,7 +441,6 @@ def coordinate_modes(
         Change of the coordinate as the point's observations stay and the cameras move by each column.
     """
     moves = np.empty((points.shape[0], modes.shape[1]))
-    fixed = pixel.copy()
     base = 6 * position.shape[0]
     most = most_views(start)
     by_point, by_pose = np.empty((most, 2, 3)), np.empty((most, 2, 6))
@@ -432,23 +449,13 @@ def coordinate_modes(
     for p in range(points.shape[0]):
         first, last = start[p], start[p + 1]
         linearise_point(
-            points[p], first, last, rotation, position, intrinsics, lens, image, fixed, weight,
+            points[p], first, last, rotation, position, intrinsics, lens, image, pixel, weight,
             by_point, by_pose, by_lens, residual, v, gradient,
         )  # fmt: skip
         invert_symmetric(v, v_inverse)
         for c in range(modes.shape[1]):
             gradient[:] = 0.0
-            for k in range(last - first):
-                i, w = image[first + k], weight[first + k]
-                at, to = 6 * i, base + N_CALIBRATION * lens[i]
-                for r in range(2):
-                    moved = 0.0
-                    for a in range(6):
-                        moved += by_pose[k, r, a] * modes[at + a, c]
-                    for a in range(N_CALIBRATION):
-                        moved += by_lens[k, r, a] * modes[to + a, c]
-                    for b in range(3):
-                        gradient[b] -= w * by_point[k, r, b] * moved
+            _take_off_moved(first, last, lens, image, weight, by_point, by_pose, by_lens, modes[:, c], base, gradient)
             moves[p, c] = (
                 v_inverse[axis, 0] * gradient[0] + v_inverse[axis, 1] * gradient[1] + v_inverse[axis, 2] * gradient[2]
             )
