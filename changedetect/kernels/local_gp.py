@@ -31,11 +31,17 @@ _BLOCK = 256
 
 
 @njit(cache=True, error_model="numpy")
+def _matern(d: float) -> float:
+    """Correlation of order 3/2 at a distance in correlation lengths."""
+    return (1.0 + d) * math.exp(-d)
+
+
+@njit(cache=True, error_model="numpy")
 def _nearest_cells(
-    window: FloatArray, cell_size: float, x0: float, y0: float, rings: int, without: bool, found: FloatArray
+    window: FloatArray, cell_size: float, x0: float, y0: float, radius: float, without: bool, found: FloatArray
 ) -> int:
     """
-    Collect the nearest occupied cells, ring by ring about the one that holds the place.
+    Collect the nearest occupied cells within a radius, ring by ring about the one that holds the place.
 
     `found`, shape (k, 6), gets squared distance, offset east and north, mean elevation, noise variance of that mean
     as observed and its weight over its count; in ascending order of distance. `without` leaves out the cell that
@@ -43,6 +49,7 @@ def _nearest_cells(
     """
     row, column = int(math.floor(y0 / cell_size)), int(math.floor(x0 / cell_size))
     k = found.shape[0]
+    rings = int(math.ceil(radius / cell_size))
     n = 0
     for ring in range(1 if without else 0, rings + 1):
         # cells of this ring are at least so far away
@@ -72,6 +79,8 @@ def _nearest_cells(
                 o[3] = m[7] / m[1]
                 o[4] = m[12] / (m[0] * m[0])
                 o[5] = m[1] / m[0]
+    while n > 0 and found[n - 1, 0] > radius * radius:
+        n -= 1
     return n
 
 
@@ -146,8 +155,6 @@ def local_processes(
     faded have it raised in proportion to the least faded cell that takes part, so that memory yields to new
     observations and keeps its precision where there are none.
     """
-    rings = int(math.ceil(radius / cell_size))
-    r2 = radius * radius
     per_l = 1.0 / correlation_length
     n_blocks = (easting.size + _BLOCK - 1) // _BLOCK
     for block in prange(n_blocks):
@@ -165,9 +172,7 @@ def local_processes(
             if not t > 0.0:
                 continue
             x0, y0 = easting[i] - column0 * cell_size, northing[i] - row0 * cell_size
-            n = _nearest_cells(window, cell_size, x0, y0, rings, without, found)
-            while n > 0 and found[n - 1, 0] > r2:
-                n -= 1
+            n = _nearest_cells(window, cell_size, x0, y0, radius, without, found)
             if n == 0:
                 continue
             freshest = 0.0
@@ -176,11 +181,9 @@ def local_processes(
             for p in range(n):
                 for q in range(p):
                     dx, dy = found[p, 1] - found[q, 1], found[p, 2] - found[q, 2]
-                    d = math.sqrt(dx * dx + dy * dy) * per_l
-                    C[p, q] = (1.0 + d) * math.exp(-d)
+                    C[p, q] = _matern(math.sqrt(dx * dx + dy * dy) * per_l)
                 C[p, p] = 1.0 + found[p, 4] * freshest / (found[p, 5] * t)
-                d = math.sqrt(found[p, 0]) * per_l
-                k[p] = (1.0 + d) * math.exp(-d)
+                k[p] = _matern(math.sqrt(found[p, 0]) * per_l)
                 z[p] = found[p, 3]
             _factorise(C, n)
             _solve(C, n, z, alpha)
@@ -230,21 +233,16 @@ def neighbour_products(
     The product z_i z_j of two neighbours has expectation t rho_ij whatever the noise, since noise is independent from
     cell to cell; an observation that stands alone has no neighbour that agrees with it.
     """
-    rings = int(math.ceil(radius / cell_size))
-    r2 = radius * radius
     per_l = 1.0 / correlation_length
     n_blocks = (easting.size + _BLOCK - 1) // _BLOCK
     for block in prange(n_blocks):
         found = np.empty((n_neighbours, 6))
         for i in range(block * _BLOCK, min(easting.size, (block + 1) * _BLOCK)):
             x0, y0 = easting[i] - column0 * cell_size, northing[i] - row0 * cell_size
-            n = _nearest_cells(window, cell_size, x0, y0, rings, True, found)
+            n = _nearest_cells(window, cell_size, x0, y0, radius, True, found)
             total = squares = 0.0
             for p in range(n):
-                if found[p, 0] > r2:
-                    break
-                d = math.sqrt(found[p, 0]) * per_l
-                rho = (1.0 + d) * math.exp(-d)
+                rho = _matern(math.sqrt(found[p, 0]) * per_l)
                 total += rho * found[p, 3]
                 squares += rho * rho
             products[i, 0] = total
