@@ -26,9 +26,11 @@ if TYPE_CHECKING:
 __all__ = [
     "N_FIT",
     "N_PLANE",
+    "RIDGE",
     "add_surface",
     "blend_planes",
     "fit_planes",
+    "invert_plane",
     "pool_noise",
     "shrink_planes",
     "survey_support",
@@ -42,7 +44,26 @@ N_FIT = 16
 #: 5 noise variance of one observation, 6 support (1 or 0), 7 mean time, 8 shrinkage factor.
 N_PLANE = 9
 #: Ridge on slopes, in observations: keeps the plane of collinear cells defined.
-_RIDGE = 1e-2
+RIDGE = 1e-2
+
+
+@njit(cache=True, error_model="numpy")
+def invert_plane(
+    s0: float, s1: float, s2: float, s3: float, s4: float, s5: float
+) -> tuple[float, float, float, float, float, float]:
+    """Inverse of the normal matrix [[s0, s1, s2], [s1, s3, s4], [s2, s4, s5]] of a plane, as 00 01 02 11 12 22."""
+    c00 = s3 * s5 - s4 * s4
+    c01 = s2 * s4 - s1 * s5
+    c02 = s1 * s4 - s2 * s3
+    det = s0 * c00 + s1 * c01 + s2 * c02
+    return (
+        c00 / det,
+        c01 / det,
+        c02 / det,
+        (s0 * s5 - s2 * s2) / det,
+        (s1 * s2 - s0 * s4) / det,
+        (s0 * s3 - s1 * s1) / det,
+    )
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -148,19 +169,11 @@ def fit_planes(
             if s0 <= 0.0:
                 continue
             n_effective = s0 * s0 / p0
-            ridge = _RIDGE * s0 / n_effective
+            ridge = RIDGE * s0 / n_effective
             s1, s2, s3, s4, s5 = s1 * per_h, s2 * per_h, s3 * per_h2 + ridge, s4 * per_h2, s5 * per_h2 + ridge
             t1, t2, t3, t4, t5 = t1 * per_h, t2 * per_h, t3 * per_h2, t4 * per_h2, t5 * per_h2
             z1, z2 = z1 * per_h, z2 * per_h
-            # inverse of the symmetric 3 x 3 normal matrix
-            c00 = s3 * s5 - s4 * s4
-            c01 = s2 * s4 - s1 * s5
-            c02 = s1 * s4 - s2 * s3
-            det = s0 * c00 + s1 * c01 + s2 * c02
-            i00, i01, i02 = c00 / det, c01 / det, c02 / det
-            i11 = (s0 * s5 - s2 * s2) / det
-            i12 = (s1 * s2 - s0 * s4) / det
-            i22 = (s0 * s3 - s1 * s1) / det
+            i00, i01, i02, i11, i12, i22 = invert_plane(s0, s1, s2, s3, s4, s5)
             o[0] = i00 * z0 + i01 * z1 + i02 * z2
             o[1] = i01 * z0 + i11 * z1 + i12 * z2
             o[2] = i02 * z0 + i12 * z1 + i22 * z2

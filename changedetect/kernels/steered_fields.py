@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING
 
 from numba import njit, prange
 
+from changedetect.kernels.receptive_fields import RIDGE, invert_plane
+
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray
 
@@ -30,8 +32,35 @@ N_GEOMETRY = 4
 #: Columns of the answer: 0 value, 1 slope east, 2 slope north, 3 noise variance of the value, 4 effective number of
 #: observations, 5 mean square of the leave-one-out errors (or residual variance), 6 that of the rival.
 N_STEERED = 7
-#: Ridge on slopes, in observations: keeps the plane of collinear cells defined.
-_RIDGE = 1e-2
+#: Activation of a cell that a field does not see.
+_UNSEEN = -1.0
+
+
+@njit(cache=True, error_model="numpy")
+def _activation(
+    m: FloatArray, x: float, y: float, ex: float, ey: float, bend: float, along: float, across: float
+) -> tuple[float, float, float]:
+    """
+    How a field sees a cell: activation, or `_UNSEEN`, and coordinates across and along, in kernels.
+
+    `m` are the cell's moments, (x, y) its centre from that of the field.
+    """
+    n = m[1]
+    if n <= 0.0:
+        return _UNSEEN, 0.0, 0.0
+    dx = x + m[2] / n
+    dy = y + m[3] / n
+    v = ex * dy - ey * dx
+    if v > 2.0 * along or v < -2.0 * along:
+        return _UNSEEN, 0.0, 0.0
+    u = ex * dx + ey * dy + 0.5 * bend * v * v
+    u /= across
+    v /= along
+    q = u * u + v * v
+    if q >= 4.0:
+        return _UNSEEN, 0.0, 0.0
+    w = 1.0 - 0.25 * q
+    return w * w, u, v
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -80,7 +109,6 @@ def fit_steered_planes(
     residual of a cell's mean and h its leverage w n x'A^-1 x, its leave-one-out error is r / (1 - h). Squared errors
     are averaged with weights w**2 n, which speak for the centre.
     """
-    radius = 2.0 * along
     for i in prange(fits.shape[0]):
         y0 = (first_row + i + 0.5) * spacing
         for j in range(fits.shape[1]):
@@ -106,22 +134,11 @@ def fit_steered_planes(
             for a in range(a_low, a_high + 1):
                 for b in range(b_low, b_high + 1):
                     m = window[a, b]
+                    x, y = (column0 + b + 0.5) * cell_size - x0, (row0 + a + 0.5) * cell_size - y0
+                    w, u, v = _activation(m, x, y, ex, ey, bend, along, across)
+                    if w < 0.0:
+                        continue
                     n = m[1]
-                    if n <= 0.0:
-                        continue
-                    dx = (column0 + b + 0.5) * cell_size - x0 + m[2] / n
-                    dy = (row0 + a + 0.5) * cell_size - y0 + m[3] / n
-                    v = ex * dy - ey * dx
-                    if v > radius or v < -radius:
-                        continue
-                    u = ex * dx + ey * dy + 0.5 * bend * v * v
-                    u /= across
-                    v /= along
-                    q = u * u + v * v
-                    if q >= 4.0:
-                        continue
-                    w = 1.0 - 0.25 * q
-                    w *= w
                     # tangents of u and v inside the cell, and second moments about its mean
                     ux = (ex - bend * v * along * ey) / across
                     uy = (ey + bend * v * along * ex) / across
@@ -160,17 +177,8 @@ def fit_steered_planes(
             if s0 <= 0.0:
                 continue
             n_effective = s0 * s0 / p0
-            ridge = _RIDGE * s0 / n_effective
-            s3 += ridge
-            s5 += ridge
-            c00 = s3 * s5 - s4 * s4
-            c01 = s2 * s4 - s1 * s5
-            c02 = s1 * s4 - s2 * s3
-            det = s0 * c00 + s1 * c01 + s2 * c02
-            i00, i01, i02 = c00 / det, c01 / det, c02 / det
-            i11 = (s0 * s5 - s2 * s2) / det
-            i12 = (s1 * s2 - s0 * s4) / det
-            i22 = (s0 * s3 - s1 * s1) / det
+            ridge = RIDGE * s0 / n_effective
+            i00, i01, i02, i11, i12, i22 = invert_plane(s0, s1, s2, s3 + ridge, s4, s5 + ridge)
             b0 = i00 * z0 + i01 * z1 + i02 * z2
             b1 = i01 * z0 + i11 * z1 + i12 * z2
             b2 = i02 * z0 + i12 * z1 + i22 * z2
@@ -194,22 +202,11 @@ def fit_steered_planes(
             for a in range(a_low, a_high + 1):
                 for b in range(b_low, b_high + 1):
                     m = window[a, b]
+                    x, y = (column0 + b + 0.5) * cell_size - x0, (row0 + a + 0.5) * cell_size - y0
+                    w, u, v = _activation(m, x, y, ex, ey, bend, along, across)
+                    if w < 0.0:
+                        continue
                     n = m[1]
-                    if n <= 0.0:
-                        continue
-                    dx = (column0 + b + 0.5) * cell_size - x0 + m[2] / n
-                    dy = (row0 + a + 0.5) * cell_size - y0 + m[3] / n
-                    v = ex * dy - ey * dx
-                    if v > radius or v < -radius:
-                        continue
-                    u = ex * dx + ey * dy + 0.5 * bend * v * v
-                    u /= across
-                    v /= along
-                    q = u * u + v * v
-                    if q >= 4.0:
-                        continue
-                    w = 1.0 - 0.25 * q
-                    w *= w
                     h = w * n * (i00 + 2.0 * (i01 * u + i02 * v) + i11 * u * u + 2.0 * i12 * u * v + i22 * v * v)
                     e = (m[7] / n - b0 - b1 * u - b2 * v) / max(1.0 - h, 0.1)
                     w *= w * n
