@@ -97,9 +97,13 @@ class CoherentTerm:
         weights : array, shape (n_rows, n_cols)
             Zero where the difference is not known.
         """
+        return np.asarray(self._gradient(weights) @ self._root())
+
+    def _gradient(self, weights: FloatArray) -> FloatArray:
+        """Weighted sum over all cells per unit of each parameter, shape (k,)."""
         flat = weights.ravel()
         used = np.flatnonzero(flat)
-        return np.asarray((flat[used] @ self.design[used]) @ self._root())
+        return np.asarray(flat[used] @ self.design[used])
 
     def _root(self) -> FloatArray:
         """R with covariance = R R', shape (k, k); the covariance may be singular."""
@@ -120,7 +124,5 @@ class CoherentTerm:
         weights : array, shape (n_rows, n_cols)
             Zero where the difference is not known.
         """
-        flat = weights.ravel()
-        used = np.flatnonzero(flat)
-        gradient = flat[used] @ self.design[used]
+        gradient = self._gradient(weights)
         return float(gradient @ self.covariance @ gradient)
