@@ -18,6 +18,8 @@ __all__ = [
     "Overwrite",
     "Pairs",
     "Resolution",
+    "ZoneLayer",
+    "ZoneNames",
     "parse_classes",
     "parse_columns",
     "parse_sigma",
@@ -49,6 +51,8 @@ Bounds = Annotated[
     tuple[float, float, float, float] | None,
     typer.Option("--bounds", metavar="WEST EAST SOUTH NORTH", help="Region in the programme's CRS, m."),
 ]
+ZoneLayer = Annotated[str | None, typer.Option("--layer", help="Layer of the zones, where the file has several.")]
+ZoneNames = Annotated[str | None, typer.Option("--name-column", help="Column with the names of the zones.")]
 Resolution = Annotated[float | None, typer.Option("--resolution", help="Cell size of the rasters, m.")]
 
 

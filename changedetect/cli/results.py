@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from changedetect.cli.options import Bounds, Directory, DryRun, EpochId, Overwrite, Resolution
+from changedetect.cli.options import (
+    Bounds,
+    Directory,
+    DryRun,
+    EpochId,
+    Overwrite,
+    Resolution,
+    ZoneLayer,
+    ZoneNames,
+)
 from changedetect.cli.session import Outcome, Session, command
 
 if TYPE_CHECKING:
@@ -155,12 +164,8 @@ def volume(
     zones: Annotated[
         Path | None, typer.Option("--zones", metavar="FILE", help="Polygons that get a budget each, in any CRS.")
     ] = None,
-    layer: Annotated[
-        str | None, typer.Option("--layer", help="Layer of the zones, where the file has several.")
-    ] = None,
-    name_column: Annotated[
-        str | None, typer.Option("--name-column", help="Column with the names of the zones.")
-    ] = None,
+    layer: ZoneLayer = None,
+    name_column: ZoneNames = None,
     bands: Annotated[
         float | None, typer.Option("--bands", metavar="HEIGHT", help="Budget per band of elevation of this height, m.")
     ] = None,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from changedetect.cli.options import Bounds, Directory, DryRun, Overwrite, Resolution
+from changedetect.cli.options import Bounds, Directory, DryRun, Overwrite, Resolution, ZoneLayer, ZoneNames
 from changedetect.cli.session import Outcome, Session, command
 
 if TYPE_CHECKING:
@@ -40,12 +40,8 @@ def series(
         Path | None,
         typer.Option("--zones", metavar="FILE", help="Polygons that get a series and budgets each, in any CRS."),
     ] = None,
-    layer: Annotated[
-        str | None, typer.Option("--layer", help="Layer of the zones, where the file has several.")
-    ] = None,
-    name_column: Annotated[
-        str | None, typer.Option("--name-column", help="Column with the names of the zones.")
-    ] = None,
+    layer: ZoneLayer = None,
+    name_column: ZoneNames = None,
     monitoring: Annotated[
         bool,
         typer.Option(

@@ -22,7 +22,7 @@ from changedetect.differencing import (
     summarise,
 )
 from changedetect.io.zones import covered_cells, read_zones
-from changedetect.pipeline.common_errors import common_terms, errors_between
+from changedetect.pipeline.common_errors import EpochError, common_terms, errors_between
 from changedetect.pipeline.rasters import predict_layers, product_grid
 from changedetect.pipeline.regions import join_regions
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from changedetect.catalogue import Programme
-    from changedetect.coregistration import Alignment
     from changedetect.grid import Grid
     from changedetect.models.base import SurfaceModel
     from changedetect.pipeline.learn import ModelShelf
@@ -149,29 +148,11 @@ def alignment_terms(
     -------
     terms : list of CoherentTerm
     """
-    return _terms(_applied_alignments(programme, epoch_ids), elevation, grid)
-
-
-def _applied_alignments(programme: Programme, epoch_ids: Sequence[str]) -> list[Alignment]:
-    applied = []
+    errors = []
     for epoch_id in epoch_ids:
         found = programme.state_record(epoch_id)
         record = None if found is None else found[0].alignment
         alignment = None if record is None else record.applied()
         if alignment is not None:
-            applied.append(alignment)
-    return applied
-
-
-def _terms(applied: Sequence[Alignment], elevation: FloatArray, grid: Grid) -> list[CoherentTerm]:
-    steep_north, steep_east = (
-        np.gradient(elevation, -grid.resolution, grid.resolution)
-        if min(grid.shape) > 1
-        else (np.zeros(grid.shape), np.zeros(grid.shape))
-    )
-    slope_east, slope_north = np.nan_to_num(steep_east).ravel(), np.nan_to_num(steep_north).ravel()
-    height = np.where(np.isfinite(elevation), elevation, np.nanmedian(elevation)).ravel()
-    easting, northing = grid.coordinates()
-    return [
-        CoherentTerm(a.offset_design(easting, northing, slope_east, slope_north, height), a.covariance) for a in applied
-    ]
+            errors.append(EpochError(("transform", epoch_id), alignment))
+    return common_terms(errors, elevation, grid)
