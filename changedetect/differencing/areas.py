@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import stats
 
-from changedetect.differencing.blocks import block_sums
+from changedetect.differencing.coarse import block_sums
 from changedetect.differencing.maps import NOT_OBSERVED
 from changedetect.differencing.outside import OutsideGround
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from changedetect.differencing.stable_ground import block_means
+from changedetect.differencing.coarse import block_means, block_sums
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from changedetect.differencing.correlation import NestedCorrelation
     from changedetect.typing import BoolArray, FloatArray
 
-__all__ = ["Blocks", "block_covariance", "block_sums", "expand", "interpolate", "standardise"]
+__all__ = ["Blocks", "block_covariance", "expand", "interpolate", "standardise"]
 
 #: The finest blocks number at most about this many along a side of the map.
 _FINEST_BLOCKS = 500
@@ -210,21 +210,3 @@ def expand(blocks: BoolArray, factor: int, shape: tuple[int, int]) -> BoolArray:
     if factor == 1:
         return blocks[: shape[0], : shape[1]]
     return np.asarray(np.repeat(np.repeat(blocks, factor, axis=0), factor, axis=1)[: shape[0], : shape[1]])
-
-
-def block_sums(values: FloatArray, factor: int) -> FloatArray:
-    """
-    Sums over blocks of cells.
-
-    Parameters
-    ----------
-    values : array, shape (n_rows, n_cols)
-    factor : int
-
-    Returns
-    -------
-    sums : array, shape (ceil(n_rows / factor), ceil(n_cols / factor))
-    """
-    padded = np.pad(values, [(0, -n % factor) for n in values.shape])
-    shape = (padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
-    return np.asarray(padded.reshape(shape).sum(axis=(1, 3)))

@@ -18,7 +18,8 @@ from scipy.ndimage import (
     maximum_filter,
 )
 
-from changedetect.differencing.blocks import block_sums, expand, interpolate
+from changedetect.differencing.blocks import expand, interpolate
+from changedetect.differencing.coarse import block_sums
 from changedetect.differencing.outside import OutsideGround
 from changedetect.differencing.stencil import disc_scores, make_stencil, predict_blocks
 

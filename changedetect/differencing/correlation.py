@@ -14,9 +14,10 @@ from scipy.optimize import nnls
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from changedetect.typing import BoolArray, FloatArray
+    from changedetect.differencing.lags import PairProducts
+    from changedetect.typing import FloatArray
 
-__all__ = ["NestedCorrelation", "PairProducts", "collect_pairs", "fit_correlation"]
+__all__ = ["NestedCorrelation", "fit_correlation"]
 
 #: Ratio of neighbouring ranges of the bank that a correlation is composed of.
 _RANGE_RATIO = math.sqrt(2.0)
@@ -24,11 +25,6 @@ _RANGE_RATIO = math.sqrt(2.0)
 _COARSE = 1.0 / 3.0
 #: A Gaussian is cut off at this many ranges.
 _CUT = 4.5
-#: Lags of the sampled products, evenly spaced in their logarithm, and pairs drawn for each.
-_N_LAGS = 28
-_N_PAIRS = 25_000
-#: Fewer pairs than this say nothing about a lag.
-_MINIMUM_PAIRS = 500
 #: Shares of the variance below this are left out of a model.
 _NEGLIGIBLE = 1e-3
 #: Weight of the variance itself among the lags of the fit.
@@ -191,92 +187,6 @@ def _quadratic_form(weights: FloatArray, side: float, length: float) -> float:
         steps = np.arange(-reach, reach + 1) * (side / length)
         smoothed = convolve1d(smoothed, np.exp(-0.5 * steps**2), axis=axis, mode="constant")
     return float(np.sum(weights * smoothed))
-
-
-@dataclass(frozen=True)
-class PairProducts:
-    """
-    Products and increments of standardised differences of cells a lag apart, and what they consist of.
-
-    With y the standardised difference, a and b the parts of its standard deviation that are due to independent and to
-    correlated errors.
-
-    Attributes
-    ----------
-    distance : array, shape (n_lags,), m
-    product : array, shape (n_lags,)
-        Mean of y_i y_j.
-    increment : array, shape (n_lags,)
-        Mean of (y_i - y_j)^2 / 2.
-    local, correlated : array, shape (n_lags,)
-        Means of a_i a_j and of b_i b_j.
-    local_square, correlated_square : array, shape (n_lags,)
-        Means of (a_i^2 + a_j^2) / 2 and of (b_i^2 + b_j^2) / 2.
-    """
-
-    distance: FloatArray
-    product: FloatArray
-    increment: FloatArray
-    local: FloatArray
-    correlated: FloatArray
-    local_square: FloatArray
-    correlated_square: FloatArray
-
-    @property
-    def strength(self) -> float:
-        """Mean of `correlated`; 1 where there is no pair, as on small rasters with scattered ground."""
-        return float(np.mean(self.correlated)) if self.correlated.size else 1.0
-
-
-def collect_pairs(
-    score: FloatArray,
-    parts: tuple[FloatArray, FloatArray],
-    usable: BoolArray,
-    resolution: float,
-    rng: np.random.Generator,
-) -> PairProducts:
-    """
-    Sample pairs of cells at lags from one cell to half the extent, in random directions.
-
-    Parameters
-    ----------
-    score : array, shape (n_rows, n_cols)
-        Standardised difference, bounded.
-    parts : pair of array, shape (n_rows, n_cols)
-        Standard deviation of the independent and of the correlated errors over that of both together.
-    usable : array, bool
-        Unchanged ground.
-    resolution : float, m
-    rng : Generator
-
-    Returns
-    -------
-    pairs : PairProducts
-        Lags with too few pairs are left out.
-    """
-    n_rows, n_cols = score.shape
-    places = np.flatnonzero(usable)
-    flat = [a.ravel() for a in (score, *parts)]
-    rows: list[tuple[float, ...]] = []
-    for lag in np.unique(np.rint(np.geomspace(1.0, max(0.5 * min(n_rows, n_cols), 2.0), _N_LAGS))):
-        if places.size < _MINIMUM_PAIRS:
-            break
-        first = rng.choice(places, _N_PAIRS)
-        angle = rng.uniform(0.0, 2.0 * math.pi, first.size)
-        down = np.rint(lag * np.sin(angle)).astype(np.int64)
-        right = np.rint(lag * np.cos(angle)).astype(np.int64)
-        row, col = first // n_cols + down, first % n_cols + right
-        inside = (row >= 0) & (row < n_rows) & (col >= 0) & (col < n_cols)
-        inside[inside] = usable[row[inside], col[inside]]
-        if np.count_nonzero(inside) < _MINIMUM_PAIRS:
-            continue
-        second = row[inside] * n_cols + col[inside]
-        first = first[inside]
-        distance = float(np.mean(np.hypot(down[inside], right[inside])))
-        (y, z), (a, b), (u, v) = ((values[first], values[second]) for values in flat)
-        means = y * z, 0.5 * (y - z) ** 2, a * b, u * v, 0.5 * (a**2 + b**2), 0.5 * (u**2 + v**2)
-        rows.append((distance * resolution, *(float(np.mean(values)) for values in means)))
-    return PairProducts(*np.array(rows).reshape(-1, 7).T)
 
 
 def fit_correlation(

@@ -60,10 +60,11 @@ def error_covariates(
     mass = np.maximum(gaussian_filter(known.astype(np.float64), width), 1e-6)
     smooth = gaussian_filter(np.where(known, elevation, 0.0), width) / mass
     rough = gaussian_filter(np.where(known, (elevation - smooth) ** 2, 0.0), width) / mass
-    logarithms = {
-        "noise": 0.5 * np.log(np.where(known, variance, 1.0) * pooled),
-        "density": np.log(pooled),
-        "slope": np.log(slope + _LEVEL),
-        "roughness": 0.5 * np.log(rough + _SMOOTH**2),
+    # single precision is plenty for logarithms, and these are held as long as the difference is
+    noise = 0.5 * np.log(np.where(known, variance, 1.0) * pooled)
+    return {
+        "noise": np.where(known, noise, 0.0).astype(np.float32),
+        "density": np.where(known, np.log(pooled), 0.0).astype(np.float32),
+        "slope": np.where(known, np.log(slope + _LEVEL), 0.0).astype(np.float32),
+        "roughness": np.where(known, 0.5 * np.log(rough + _SMOOTH**2), 0.0).astype(np.float32),
     }
-    return {name: np.where(known, values, 0.0) for name, values in logarithms.items()}

@@ -17,10 +17,11 @@ import numpy as np
 
 from changedetect.differencing.blocks import expand, standardise
 from changedetect.differencing.candidates import find_candidates
-from changedetect.differencing.clusters import normal_score
-from changedetect.differencing.correlation import NestedCorrelation, collect_pairs, fit_correlation
+from changedetect.differencing.coarse import block_means
+from changedetect.differencing.correlation import NestedCorrelation, fit_correlation
 from changedetect.differencing.error_scale import ErrorScale, Sample, fit_scale, half_width_scale, select_scale
-from changedetect.differencing.stable_ground import block_means, find_changed
+from changedetect.differencing.lags import CellScores, collect_pairs, standardised_scores
+from changedetect.differencing.stable_ground import find_changed
 from changedetect.differencing.stencil import choose_stencil
 
 if TYPE_CHECKING:
@@ -32,14 +33,14 @@ __all__ = ["ErrorModel", "TooLittleGroundError", "estimate_errors"]
 
 #: Cells the scale is estimated from, and those that looking for change starts with.
 _N_SAMPLE = 15_000
+#: Cells that means over all ground are taken from, at most.
+_N_MEANS = 500_000
 #: Rounds of: scale, correlation, changed ground.
 _ROUNDS = 4
 #: Rounds more, in which changed ground is told by what the ground around says.
 _LATER_ROUNDS = 2
 #: Part of the known ground that must be left.
 _LEAST_SHARE = 0.3
-#: Scores count up to this limit, where the errors' tails are heavier than normal.
-_SCORE_LIMIT = 4.0
 #: Tails assumed while change has not been looked for.
 _FIRST_FREEDOM = 4.0
 #: Blocks of ground that are held out in turn: this many where errors are correlated over short distances.
@@ -184,7 +185,8 @@ def estimate_errors(
                 resolution, local_range,
             )  # fmt: skip
             left = known & ~changed
-            if np.count_nonzero(left) < _LEAST_CELLS:
+            settled = k > 0 and np.array_equal(left, ground)
+            if settled or np.count_nonzero(left) < _LEAST_CELLS:
                 break
             ground = left
     if stable is None and model.is_correlated:
@@ -218,7 +220,8 @@ def _estimate_again(
         given = np.nan_to_num(block_means(changed.astype(np.float64), known, finest.factor)[0]) > 0.5
         found = find_candidates(finest, chosen[0], correlations, given)
         left = known & ~expand(found, finest.factor, known.shape)
-        if np.count_nonzero(left) < max(_LEAST_CELLS, _LEAST_SHARE * np.count_nonzero(known)):
+        settled = np.array_equal(left, ground)
+        if settled or np.count_nonzero(left) < max(_LEAST_CELLS, _LEAST_SHARE * np.count_nonzero(known)):
             break
         ground = left
         if k == _LATER_ROUNDS:
@@ -245,15 +248,20 @@ def _estimate_round(
     n_independent = max(area / max(_squared_area(before), resolution**2), 1.0)
     sample = _draw_sample(difference, variance, covariates, ground, resolution, n_independent, before, rng)
     scale = fit_scale(sample, _FIRST_FREEDOM) if is_first else select_scale(sample)
-    s2 = np.broadcast_to(scale.variance(covariates), difference.shape)
-    total = variance + s2
-    parts = (np.sqrt(variance / total), np.sqrt(s2 / total))
-    score = difference / np.sqrt(total)
-    usable = ground & (np.abs(normal_score(score, scale.freedom)) < _SCORE_LIMIT)
-    if not usable.any() or float(np.mean((s2 / total)[usable])) < _NEGLIGIBLE_SHARE:
+    cells = [np.asarray(values).ravel() for values in (difference, variance)]
+    columns = {name: np.asarray(values).ravel() for name, values in covariates.items()}
+
+    def at(places: IntArray) -> CellScores:
+        correlated = scale.variance({name: values[places] for name, values in columns.items()})
+        return standardised_scores(cells[0][places], cells[1][places], correlated, scale.freedom)
+
+    places = np.flatnonzero(ground)
+    every = at(places if places.size <= _N_MEANS else rng.choice(places, _N_MEANS, replace=False)).counting()
+    correlated_share = float(np.mean(every.correlated**2)) if every.score.size else 0.0
+    if correlated_share < _NEGLIGIBLE_SHARE:
         return replace(before, scale=scale, correlation=NestedCorrelation((), ()), n_independent=n_independent)
-    pairs = collect_pairs(score, parts, usable, resolution, rng)
-    excess = float(np.mean(score[usable] ** 2) - np.mean(parts[0][usable] ** 2)) / float(np.mean(parts[1][usable] ** 2))
+    pairs = collect_pairs(at, ground, resolution, rng)
+    excess = float(np.mean(every.score**2) - np.mean(every.local**2)) / correlated_share
     extent = resolution * min(difference.shape)
     correlation = fit_correlation(
         pairs, before.local, max(excess, 0.0) * pairs.strength, before.local.ranges[0], _LONGEST_RANGE * extent

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special, stats
 
+from changedetect.differencing.clusters import normal_score
 from changedetect.differencing.resolution import FIELD_AREA, KERNEL_WIDTH, Resolution
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ SURFACE_RAISED = 2
 NOT_OBSERVED = 3
 #: Ground that no epoch saw.
 OUTSIDE = 255
+#: Degrees of freedom from which on a normal score stands for Student's t.
+_MANY = 20.0
 
 
 @dataclass(frozen=True)
@@ -200,7 +203,7 @@ def judge_change(evidence: Evidence, errors: CellErrors, settings: DifferencingC
     nu = _combined_freedom(local, errors, variance, np.maximum(evidence.freedom, 1.0))
     lod = _t_quantile(0.5 + 0.5 * settings.confidence, nu) * std
     threshold = settings.change_threshold_m
-    inside = special.stdtr(nu, (threshold - d) / std) - special.stdtr(nu, (-threshold - d) / std)
+    inside = _t_probability((threshold - d) / std, nu) - _t_probability((-threshold - d) / std, nu)
     observed = evidence.observed
     classes = np.full(d.shape, OUTSIDE, np.uint8)
     classes[observed[0] | observed[1]] = NOT_OBSERVED
@@ -240,6 +243,14 @@ def _combined_freedom(local: FloatArray, errors: CellErrors, variance: FloatArra
     shared = errors.correlated if errors.prediction is None else errors.prediction.variance
     spread = local**2 / freedom + (0.0 if math.isinf(tails) else shared**2 / tails)
     return np.asarray(variance**2 / spread)
+
+
+def _t_probability(t: FloatArray, freedom: FloatArray) -> FloatArray:
+    """Distribution function of Student's t, within 3e-5; exact below `_MANY` degrees of freedom."""
+    few = freedom < _MANY
+    probability = np.asarray(special.ndtr(normal_score(t, freedom)))
+    probability[few] = special.stdtr(freedom[few], t[few])
+    return probability
 
 
 def _t_quantile(probability: float, freedom: FloatArray) -> FloatArray:

@@ -10,7 +10,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import distance_transform_edt
 
-from changedetect.differencing.blocks import block_covariance, block_sums
+from changedetect.differencing.blocks import block_covariance
+from changedetect.differencing.coarse import block_sums
 
 if TYPE_CHECKING:
     from changedetect.differencing.blocks import Blocks

@@ -14,17 +14,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from changedetect.differencing.blocks import Blocks, block_sums, interpolate, standardise
-from changedetect.differencing.clusters import normal_score
-from changedetect.differencing.correlation import NestedCorrelation, collect_pairs, fit_correlation
+from changedetect.differencing.blocks import Blocks, interpolate, standardise
+from changedetect.differencing.coarse import block_sums
+from changedetect.differencing.correlation import NestedCorrelation, fit_correlation
 from changedetect.differencing.error_scale import Sample, fit_scale, half_width_scale
+from changedetect.differencing.lags import CellScores, collect_pairs, standardised_scores
 from changedetect.differencing.stencil import HOLE, Stencil, choose_stencil, predict_blocks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from changedetect.differencing.error_model import ErrorModel
-    from changedetect.typing import BoolArray, FloatArray, JSONObject
+    from changedetect.typing import BoolArray, FloatArray, IntArray, JSONObject
 
 __all__ = ["ErrorPrediction", "predict_errors"]
 
@@ -36,9 +37,7 @@ _WANTED = 0.5
 #: Cells that the variance left is checked with, and limits of its correction.
 _N_CHECKED = 15_000
 _LEAST_INFLATION, _LARGEST_INFLATION = 0.2, 4.0
-#: Scores count up to this limit for the correlation of what is left.
-_SCORE_LIMIT = 4.0
-#: ... which is found on so many rows and columns in the middle of the map.
+#: The correlation of what is left is found on so many rows and columns in the middle of the map.
 _MIDDLE = 1000
 
 
@@ -246,13 +245,14 @@ def _correlation_left(
     resolution: float,
 ) -> NestedCorrelation:
     """Correlation of what is left of the correlated errors."""
-    total = variances[0] + variances[1]
-    parts = (np.sqrt(variances[0] / total), np.sqrt(variances[1] / total))
-    score = left / np.sqrt(total)
-    usable = ground & (np.abs(normal_score(score, model.scale.freedom)) < _SCORE_LIMIT)
     shortest = model.local.ranges[0]
-    if np.count_nonzero(usable) < 2:
+    if np.count_nonzero(ground) < 2:
         return NestedCorrelation((shortest,), (1.0,))
-    pairs = collect_pairs(score, parts, usable, resolution, np.random.default_rng(14))
+    cells = [values.ravel() for values in (left, *variances)]
+
+    def at(places: IntArray) -> CellScores:
+        return standardised_scores(cells[0][places], cells[1][places], cells[2][places], model.scale.freedom)
+
+    pairs = collect_pairs(at, ground, resolution, np.random.default_rng(14))
     found = fit_correlation(pairs, model.local, pairs.strength, shortest, model.correlation.ranges[-1])
     return found.normalised() if found.ranges else NestedCorrelation((shortest,), (1.0,))

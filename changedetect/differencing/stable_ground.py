@@ -9,12 +9,13 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from changedetect.differencing.clusters import find_clusters, normal_score, q_values, simulate_null
+from changedetect.differencing.coarse import block_means
 
 if TYPE_CHECKING:
     from changedetect.differencing.correlation import NestedCorrelation
     from changedetect.typing import BoolArray, FloatArray
 
-__all__ = ["block_means", "find_changed"]
+__all__ = ["find_changed"]
 
 #: A coarse raster has at most about this many cells along a side.
 _COARSE_CELLS = 400
@@ -31,35 +32,6 @@ _STRONG_SHARE = 0.2
 _SIMULATED_CELLS = 8e5
 #: A coarse cell is known where this share of its cells is.
 _LEAST_SHARE = 0.5
-
-
-def block_means(values: FloatArray, known: BoolArray, factor: int) -> tuple[FloatArray, FloatArray]:
-    """
-    Means over blocks of cells, and the share of each block that is known.
-
-    Parameters
-    ----------
-    values : array, shape (n_rows, n_cols)
-    known : array, bool
-    factor : int
-        Cells along the side of a block.
-
-    Returns
-    -------
-    mean, share : array, shape (ceil(n_rows / factor), ceil(n_cols / factor))
-        The mean is NaN where nothing is known.
-    """
-    n_rows, n_cols = values.shape
-    pad = ((0, -n_rows % factor), (0, -n_cols % factor))
-
-    def total(array: FloatArray) -> FloatArray:
-        padded = np.pad(array, pad)
-        shape = (padded.shape[0] // factor, factor, padded.shape[1] // factor, factor)
-        return np.asarray(padded.reshape(shape).sum(axis=(1, 3)))
-
-    count = total(known.astype(np.float64))
-    with np.errstate(invalid="ignore"):
-        return total(np.where(known, values, 0.0)) / count, count / factor**2
 
 
 def find_changed(

@@ -42,7 +42,7 @@ _LEAST_BLOCKS = 10
 #: Part of the variance added to the diagonal, against rounding.
 _RIDGE = 1e-6
 #: Places solved together.
-_BATCH = 256
+_BATCH = 4096
 #: Fewer blocks than this predict nothing.
 _LEAST_DATA = 3
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from error_fields import smooth_field
 
-from changedetect.differencing.correlation import NestedCorrelation, PairProducts, collect_pairs, fit_correlation
+from changedetect.differencing.correlation import NestedCorrelation, fit_correlation
+from changedetect.differencing.lags import PairProducts, collect_pairs, standardised_scores
 
 NESTED = NestedCorrelation((1.5, 9.0, 60.0), (0.3, 0.5, 0.2))
 
@@ -71,7 +72,12 @@ def test_a_correlation_is_found_again_under_independent_errors():
     shape = (400, 400)
     local, longer = smooth_field(rng, shape, 0.6, 1.5), smooth_field(rng, shape, 0.8, 12.0)
     parts = (np.full(shape, 0.6), np.full(shape, 0.8))
-    pairs = collect_pairs(local + longer, parts, np.ones(shape, bool), 1.0, np.random.default_rng(1))
+    cells = [values.ravel() for values in (local + longer, *parts)]
+
+    def at(places):
+        return standardised_scores(cells[0][places], cells[1][places] ** 2, cells[2][places] ** 2, np.inf)
+
+    pairs = collect_pairs(at, np.ones(shape, bool), 1.0, np.random.default_rng(1))
     found = fit_correlation(pairs, NestedCorrelation((1.5,), (1.0,)), 0.64, 1.5, 100.0)
     np.testing.assert_allclose(found.variance, 1.0, rtol=0.0, atol=0.08)
     at = np.array([3.0, 8.0, 12.0, 20.0, 40.0])
@@ -81,8 +87,17 @@ def test_a_correlation_is_found_again_under_independent_errors():
 def test_lags_without_enough_pairs_are_left_out():
     usable = np.zeros((60, 60), bool)
     usable[:25, :25] = True
-    score = np.zeros((60, 60))
-    pairs = collect_pairs(score, (score, score), usable, 1.0, np.random.default_rng(1))
+
+    def at(places):
+        return standardised_scores(np.zeros(places.size), np.ones(places.size), 0.0, np.inf)
+
+    pairs = collect_pairs(at, usable, 1.0, np.random.default_rng(1))
     assert isinstance(pairs, PairProducts)
     assert pairs.distance.size > 3
     assert pairs.distance.max() < 35.0
+
+
+def test_scores_beyond_what_errors_reach_do_not_count():
+    cells = standardised_scores(np.array([0.01, 0.5, np.nan]), np.full(3, 1e-4), 0.0, np.inf)
+    assert cells.counts.tolist() == [True, False, False]
+    np.testing.assert_allclose(cells.counting().score, [1.0], rtol=1e-12, atol=0.0)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from error_fields import quiet
 
+from changedetect.differencing.coarse import block_means
 from changedetect.differencing.correlation import NestedCorrelation
-from changedetect.differencing.stable_ground import block_means, find_changed
+from changedetect.differencing.stable_ground import find_changed
 
 LOCAL, LONGER = NestedCorrelation((1.5,), (1.0,)), NestedCorrelation((8.0,), (1.0,))
 
