@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit, prange
 
+from changedetect.kernels.compilation import FUSED
+
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray
 
@@ -30,13 +32,13 @@ N_NEAREST = 16
 _BLOCK = 256
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
 def _matern(d: float) -> float:
     """Correlation of order 3/2 at a distance in correlation lengths."""
     return (1.0 + d) * math.exp(-d)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
 def _nearest_cells(
     window: FloatArray, cell_size: float, x0: float, y0: float, radius: float, without: bool, found: FloatArray
 ) -> int:
@@ -84,7 +86,7 @@ def _nearest_cells(
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
 def _factorise(C: FloatArray, n: int) -> None:
     """Cholesky factor of the leading n rows, in place below the diagonal."""
     for i in range(n):
@@ -98,7 +100,7 @@ def _factorise(C: FloatArray, n: int) -> None:
                 C[i, j] = s / C[j, j]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
 def _solve(C: FloatArray, n: int, b: FloatArray, x: FloatArray) -> None:
     """Solve L L' x = b with the factor of `_factorise`."""
     for i in range(n):
@@ -113,7 +115,7 @@ def _solve(C: FloatArray, n: int, b: FloatArray, x: FloatArray) -> None:
         x[i] = s / C[i, i]
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FUSED)
 def local_processes(
     window: FloatArray,
     cell_size: float,
@@ -200,7 +202,7 @@ def local_processes(
             o[4] = total
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FUSED)
 def neighbour_products(
     window: FloatArray,
     cell_size: float,

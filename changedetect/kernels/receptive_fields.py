@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numba import njit, prange
 
+from changedetect.kernels.compilation import FUSED
+
 if TYPE_CHECKING:
     from changedetect.typing import FloatArray
 
@@ -47,7 +49,7 @@ N_PLANE = 9
 RIDGE = 1e-2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
 def invert_plane(
     s0: float, s1: float, s2: float, s3: float, s4: float, s5: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -66,7 +68,7 @@ def invert_plane(
     )
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FUSED)
 def fit_planes(
     window: FloatArray,
     cell_size: float,
@@ -203,7 +205,7 @@ def fit_planes(
             o[15] = s0 / count
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
 def _posterior_plane(o: FloatArray, t0: float, t1: float) -> tuple[float, float, float, float]:
     """Weight of the value and posterior mean of the plane under a prior of variances t0 (value) and t1 (slopes)."""
     if t0 <= 0.0 and t1 <= 0.0:
@@ -225,7 +227,7 @@ def _posterior_plane(o: FloatArray, t0: float, t1: float) -> tuple[float, float,
     return t0 * c00 / det, b0, b1, b2
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FUSED)
 def shrink_planes(
     fits: FloatArray,
     base: FloatArray,
@@ -299,7 +301,7 @@ def shrink_planes(
             planes[4, i, j] = 1.0 / gamma
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FUSED)
 def blend_planes(
     easting: FloatArray,
     northing: FloatArray,
@@ -379,7 +381,7 @@ def blend_planes(
         o[7] = 1.0
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FUSED)
 def add_surface(
     easting: FloatArray,
     northing: FloatArray,
@@ -437,7 +439,7 @@ def add_surface(
             surface[p, 2] += fy / w_sum
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FUSED)
 def pool_noise(
     fits: FloatArray, row: int, column: int, reach: int, n_minimum: float, fallback: float, pooled: FloatArray
 ) -> None:
@@ -497,7 +499,7 @@ def pool_noise(
             pooled[i, j] = ratio[k] / (1.0 - 2.0 / (9.0 * nu)) ** 3
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FUSED)
 def survey_support(
     window: FloatArray,
     cell_size: float,

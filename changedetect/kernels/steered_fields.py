@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 from numba import njit, prange
 
+from changedetect.kernels.compilation import FUSED
 from changedetect.kernels.receptive_fields import RIDGE, invert_plane
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ N_STEERED = 7
 _UNSEEN = -1.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FUSED)
 def _activation(
     m: FloatArray, x: float, y: float, ex: float, ey: float, bend: float, along: float, across: float
 ) -> tuple[float, float, float]:
@@ -63,7 +64,7 @@ def _activation(
     return w * w, u, v
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, error_model="numpy", fastmath=FUSED)
 def fit_steered_planes(
     window: FloatArray,
     cell_size: float,
