@@ -43,6 +43,10 @@ _FEW = 1e-3
 _DOUBT = 5.0
 #: Neighbours of a cell whose products with it are taken.
 _N_NEIGHBOURS = 4
+#: Degrees of freedom that variance is taken to have, at least.
+_LEAST_FREEDOM = 4.0
+#: Different pairs that each cell adds: four neighbours, and a pair is two cells.
+_PAIRS = 0.5 * _N_NEIGHBOURS
 #: Variance of the process, in mean squares of the left-over, at least: noise is not known better.
 _SMALLEST = 0.02
 
@@ -55,9 +59,9 @@ def _field_of(cells: Cells, lattice: Lattice) -> tuple[IntArray, IntArray]:
     return np.clip(row, 0, lattice.n_rows - 1), np.clip(column, 0, lattice.n_columns - 1)
 
 
-def process_variance(left: Cells, lattice: Lattice, length: float, radius: float) -> FloatArray:
+def process_variance(left: Cells, lattice: Lattice, length: float, radius: float) -> tuple[FloatArray, FloatArray]:
     """
-    Variance of the true left-over around each field.
+    Variance of the true left-over around each field, and how well it is known.
 
     Parameters
     ----------
@@ -70,6 +74,8 @@ def process_variance(left: Cells, lattice: Lattice, length: float, radius: float
     Returns
     -------
     variance : array, shape (n_rows, n_columns), m2
+    freedom : array, shape (n_rows, n_columns)
+        Its degrees of freedom: pairs of neighbours in the near window, two a cell.
 
     Notes
     -----
@@ -101,13 +107,14 @@ def process_variance(left: Cells, lattice: Lattice, length: float, radius: float
         weight = window_sum(mass, reach) + few
         found.append((window_sum(product, reach) + few * max(float(product.sum() / mass.sum()), 0.0)) / weight)
     near, wide = found
-    count = window_sum(np.ones(len(left)), _NEAR)
+    # a window of standard deviation r averages over 4 pi r**2 fields
+    n_near = np.maximum(4.0 * math.pi * _NEAR**2 * window_sum(np.ones(len(left)), _NEAR), 1.0)
     total = (window_sum(square, _WIDE) + _FEW * square.mean()) / (window_sum(np.ones(len(left)), _WIDE) + _FEW)
-    chance = 2.0 * total**2 / np.maximum(count * 4.0 * math.pi * _NEAR**2, 1.0)
+    chance = 2.0 * total**2 / n_near
     difference = near - wide
     share = np.clip(1.0 - chance / np.maximum(difference**2, 1e-30), 0.0, 1.0)
     variance: FloatArray = np.maximum(wide + share * difference, _SMALLEST * total)
-    return variance
+    return variance, _PAIRS * n_near
 
 
 def _blocks(
@@ -147,14 +154,15 @@ def refine_by_processes(
     -----
     With t the variance of the process, C its covariance with noise and k that with the place, the surface has variance
     t - k'C^-1 k + (1 - sum(C^-1 k))**2 v: of the coarse surface's variance v only that part counts which the
-    observations nearby do not correct.
+    observations nearby do not correct. The first part counts nu / (nu - 2) times, nu the degrees of freedom behind t:
+    the variance of Student's t, which the error has where the variance of the process is itself an estimate.
     """
     coarse = tuple(k for k in kernels if k >= _COARSE * kernels[-1]) or kernels[:1]
     base, _ = refine(cells, coarse, lattice_spacing, shrinkage)
     left = cells.with_surface_removed(base.blend(*cells.places)[:, :3])
     lattice = Lattice.covering(cells.region, kernels[-1], lattice_spacing * kernels[-1])
     length, radius = _CORRELATION_LENGTH * coarse[-1], _RADIUS * coarse[-1]
-    variance = process_variance(left, lattice, length, radius)
+    variance, freedom = process_variance(left, lattice, length, radius)
     alone = _answers(left, lattice, variance, length, radius, at_cells=True)
     noise = left.moments[:, 12] / left.moments[:, 0] ** 2
     left_out = (left.moments[:, 7] / left.moments[:, 1] - alone[:, 0]) ** 2
@@ -165,7 +173,8 @@ def refine_by_processes(
     below = base.blend(*lattice.centres()).reshape(*lattice.shape, -1)
     planes = np.zeros((N_PLANE, *lattice.shape))
     planes[:3] = np.moveaxis(below[..., :3] + fits[..., :3], -1, 0)
-    planes[3] = fits[..., 3] + (1.0 - fits[..., 4]) ** 2 * below[..., 3]
+    freedom = np.maximum(freedom, _LEAST_FREEDOM)
+    planes[3] = fits[..., 3] * freedom / (freedom - 2.0) + (1.0 - fits[..., 4]) ** 2 * below[..., 3]
     planes[4] = below[..., 7] > 0.0
     return Level(lattice, planes), left_out
 
