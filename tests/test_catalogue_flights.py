@@ -21,6 +21,7 @@ from changedetect.catalogue import (
 )
 from changedetect.catalogue.epoch import read_epoch, write_epoch
 from changedetect.errors import ConfigError, ModelStateError
+from changedetect.grid import Grid
 from changedetect.pipeline import common_errors
 from changedetect.pipeline.flight_inputs import is_flight_folder, listing_sha256
 
@@ -162,9 +163,64 @@ def test_flights_that_nothing_binds_keep_both_their_errors(programme):
     assert sources == {("flight", "a"), ("flight", "b")}
 
 
-def test_the_design_of_a_common_error_is_offset_tilt_and_shift_on_the_slope():
-    from changedetect.grid import Grid
+def shares(programme, *epoch_ids):
+    """What each epoch of a series carries: sources of errors and the factors of their variances."""
+    found = common_errors.errors_apart(programme, epoch_ids)
+    return [{error.source: error.factor for error in errors} for errors in found]
 
+
+def test_what_all_epochs_of_a_series_share_counts_for_none_of_them(programme):
+    settings = programme.config.flight_settings
+    first = write(programme, record("a", settings))
+    second = write(programme, record("b", settings, (anchor("a", first),)))
+    write(programme, record("c", settings, (anchor("a", first), anchor("b", second))))
+    assert shares(programme, "a", "b", "c") == [{}, {("photos", "b", "a"): 1.0}, {("photos", "c", "a"): 1.0}]
+    assert shares(programme, "b", "c") == [{("photos", "b", "a"): 1.0}, {("photos", "c", "a"): 1.0}]
+
+
+def test_what_some_epochs_share_makes_no_contrast_of_the_series_too_certain(programme):
+    settings = programme.config.flight_settings
+    first = write(programme, record("a", settings))
+    write(programme, record("b", settings, (anchor("a", first),)))
+    write(programme, record("c", settings, (anchor("b", "lost"),)))
+    late = Epoch(epoch_id="d", date=parse_date("2024-04-01"), sources=(flight_source(),))
+    programme = programme.write_epoch(late)
+    write(programme, record("d", settings, (anchor("b", "lost"),)))
+    epochs = ("a", "b", "c", "d")
+    found = shares(programme, *epochs)
+    # b, c and d lie as b does: one error of all three, told of the first alone
+    assert found[0] == {("photos", "b", "a"): 1.0}
+    assert found[1:] == [{}, {("photos", "c", "b"): 1.0}, {("photos", "d", "b"): 1.0}]
+    rng = np.random.default_rng(3)
+    weights = rng.normal(size=(200, 4))
+    weights -= weights.mean(axis=1, keepdims=True)
+    for chosen in (epochs, ("b", "c", "a")):
+        carried = [{error.source for error in common_errors.errors_of(programme, e)} for e in chosen]
+        apart = shares(programme, *chosen)
+        w = weights[:, : len(chosen)] - weights[:, : len(chosen)].mean(axis=1, keepdims=True)
+        true = sum(w[:, [source in mine for mine in carried]].sum(axis=1) ** 2 for source in set().union(*carried))
+        said = w**2 @ np.array([sum(mine.values()) for mine in apart])
+        assert (said >= true - 1e-12).all()
+
+
+def test_an_error_of_half_of_the_epochs_counts_with_their_number(programme):
+    settings = programme.config.flight_settings
+    first = write(programme, record("a", settings))
+    write(programme, record("b", settings, (anchor("a", first, None),)))
+    write(programme, record("c", settings, (anchor("b", "lost"),)))
+    write_d = Epoch(epoch_id="d", date=parse_date("2024-04-01"), sources=(flight_source(),))
+    programme = programme.write_epoch(write_d)
+    write(programme, record("d", settings, (anchor("a", first),)))
+    found = shares(programme, "a", "b", "c", "d")
+    assert found[0] == {("flight", "a"): 2.0}
+    assert found[3] == {("photos", "d", "a"): 1.0, ("flight", "a"): 2.0}
+    (error,) = common_errors.errors_apart(programme, ("a", "b", "c", "d"))[0]
+    grid = Grid(2, 2, 0.0, 4.0, 2.0, CRS)
+    (term,) = common_errors.common_terms((error,), np.zeros(grid.shape), grid)
+    np.testing.assert_allclose(term.covariance, 2.0 * np.eye(5), rtol=0, atol=0)
+
+
+def test_the_design_of_a_common_error_is_offset_tilt_and_shift_on_the_slope():
     grid = Grid(4, 5, 100.0, 200.0, 2.0, CRS)
     easting, northing = grid.coordinates()
     elevation = (0.1 * easting - 0.3 * northing).reshape(grid.shape)

@@ -8,6 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
+import xarray as xr
 from numpy.testing import assert_allclose
 from small_flights import CRS, FIRST, SECOND, TrueChange, fly, nmad
 from small_surveys import run, snapshot
@@ -270,3 +271,15 @@ def test_errors_that_flights_share_cancel_and_others_do_not(both):
     summary = json.loads((both / f"products/{FIRST}_{SECOND}/summary.json").read_text())
     offset = np.sqrt(error.content.covariance[0][0])
     assert summary["volume_net_std_m3"] > 0.8 * offset * summary["area_observed_m2"]
+
+
+def test_a_series_of_flights_knows_their_errors_and_what_of_them_cancels(both, tmp_path, capsys):
+    (error,) = errors_between(opened(both), FIRST, SECOND)
+    offset = np.sqrt(error.content.covariance[0][0])
+    done = run(capsys, "series", both, "-o", tmp_path / "series.nc", "--resolution", 1)
+    first, second = done["whole"]["series"]
+    assert first["change_mean_std_m"] == 0.0
+    assert 0.8 * offset < second["change_mean_std_m"] < 0.3  # the GPS offset of a metre is that of both
+    with xr.open_dataset(tmp_path / "series.nc") as series:
+        known = np.isfinite(series.dod.values[1])
+        assert series.dod_std.values[1][known].min() > 0.8 * offset

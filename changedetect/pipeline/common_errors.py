@@ -9,7 +9,7 @@ difference, the rest enters as coherent terms.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from changedetect.grid import Grid
     from changedetect.typing import FloatArray
 
-__all__ = ["EpochError", "common_terms", "errors_between", "errors_of"]
+__all__ = ["EpochError", "common_terms", "errors_apart", "errors_between", "errors_of"]
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,13 @@ class EpochError:
         What it comes from: ("transform", epoch), ("flight", epoch) or ("photos", epoch, epoch it was adjusted to).
     content : Alignment or CommonErrorRecord
         With its covariance.
+    factor : float
+        That the covariance counts with.
     """
 
     source: tuple[str, ...]
     content: Alignment | CommonErrorRecord
+    factor: float = 1.0
 
 
 def errors_between(programme: Programme, earlier: str, later: str) -> tuple[EpochError, ...]:
@@ -89,6 +92,43 @@ def errors_of(programme: Programme, epoch_id: str) -> tuple[EpochError, ...]:
     return (EpochError(("flight", epoch_id), found[0]),)
 
 
+def errors_apart(programme: Programme, epoch_ids: Sequence[str]) -> list[tuple[EpochError, ...]]:
+    """
+    Errors of every epoch of a series, as if no two epochs had one in common.
+
+    Parameters
+    ----------
+    programme : Programme
+    epoch_ids : sequence of str
+
+    Returns
+    -------
+    errors : list of tuple of EpochError
+        One tuple an epoch.
+
+    Notes
+    -----
+    Only differences of epochs mean anything. An error e that k of n epochs share adds e sum_S w_i to a contrast of
+    weights w, sum w = 0: nothing where k = n, and as much as one of the other n - k epochs sharing -e. With m the
+    number of epochs on the smaller side, (sum_S w_i)^2 <= m sum_S w_i^2 there (Cauchy and Schwarz): an error of its
+    own of m times the variance for each of these makes the variance of no contrast too small, and is exact for m = 1,
+    as where every flight was adjusted to the first one.
+    """
+    found = [errors_of(programme, epoch_id) for epoch_id in epoch_ids]
+    sharers: dict[tuple[str, ...], list[int]] = {}
+    for k, errors in enumerate(found):
+        for error in errors:
+            sharers.setdefault(error.source, []).append(k)
+    by_source = {error.source: error for errors in found for error in errors}
+    apart: list[list[EpochError]] = [[] for _ in epoch_ids]
+    for source, inside in sharers.items():
+        outside = [k for k in range(len(found)) if k not in inside]
+        side = min(inside, outside, key=len)
+        for k in side:
+            apart[k].append(replace(by_source[source], factor=float(len(side))))
+    return [tuple(errors) for errors in apart]
+
+
 def common_terms(errors: Sequence[EpochError], elevation: FloatArray, grid: Grid) -> list[CoherentTerm]:
     """
     Errors as functions of place.
@@ -117,7 +157,7 @@ def common_terms(errors: Sequence[EpochError], elevation: FloatArray, grid: Grid
             centre = content.centre  # type: ignore[union-attr]
             flat = [np.ones(easting.size), easting - centre[0], northing - centre[1]]
             design = np.column_stack([*flat, -slope_east, -slope_north])
-        terms.append(CoherentTerm(design, np.asarray(content.covariance, dtype=np.float64)))
+        terms.append(CoherentTerm(design, error.factor * np.asarray(content.covariance, dtype=np.float64)))
     return terms
 
 

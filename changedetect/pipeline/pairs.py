@@ -22,22 +22,20 @@ from changedetect.differencing import (
     summarise,
 )
 from changedetect.io.zones import covered_cells, read_zones
-from changedetect.pipeline.common_errors import EpochError, common_terms, errors_between
+from changedetect.pipeline.common_errors import common_terms, errors_between
 from changedetect.pipeline.rasters import predict_layers, product_grid
 from changedetect.pipeline.regions import join_regions
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from changedetect.catalogue import Programme
     from changedetect.grid import Grid
     from changedetect.models.base import SurfaceModel
     from changedetect.pipeline.learn import ModelShelf
-    from changedetect.typing import BoolArray, FloatArray, JSONObject
+    from changedetect.typing import BoolArray, JSONObject
 
-__all__ = ["PairDifference", "alignment_terms", "difference_pair", "stable_cells"]
+__all__ = ["PairDifference", "difference_pair", "stable_cells"]
 
 logger = logging.getLogger(__name__)
 
@@ -127,32 +125,3 @@ def _alignment_terms(
     """Errors that whole epochs share and the other has not; ground that the earlier did not see counts as level."""
     errors = errors_between(programme, *epoch_ids)
     return common_terms(errors, predict_layers(surface, grid)["elevation"], grid) if errors else []
-
-
-def alignment_terms(
-    programme: Programme, epoch_ids: Sequence[str], elevation: FloatArray, grid: Grid
-) -> list[CoherentTerm]:
-    """
-    Errors of the transforms that moved epochs to the programme's first.
-
-    Parameters
-    ----------
-    programme : Programme
-    epoch_ids : sequence of str
-        Those that were not moved have none.
-    elevation : array, shape (n_rows, n_cols), m
-        Terrain; where it is NaN the ground counts as level.
-    grid : Grid
-
-    Returns
-    -------
-    terms : list of CoherentTerm
-    """
-    errors = []
-    for epoch_id in epoch_ids:
-        found = programme.state_record(epoch_id)
-        record = None if found is None else found[0].alignment
-        alignment = None if record is None else record.applied()
-        if alignment is not None:
-            errors.append(EpochError(("transform", epoch_id), alignment))
-    return common_terms(errors, elevation, grid)

@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
     from changedetect.catalogue import Epoch, Programme
     from changedetect.differencing.areas import AreaBudget
-    from changedetect.differencing.coherent import CoherentTerm
     from changedetect.differencing.error_model import ErrorModel
     from changedetect.grid import Grid
     from changedetect.io.zones import Zone
+    from changedetect.timeseries.differences import TermsOfEpochs
     from changedetect.timeseries.stack import Stack
     from changedetect.typing import FloatArray, JSONObject, Region
 
@@ -76,7 +76,7 @@ class _Problem:
     grid: Grid
     stack: Stack
     models: list[ErrorModel]
-    terms: Callable[[int], list[CoherentTerm]]
+    terms: TermsOfEpochs
     level: float
 
     @property

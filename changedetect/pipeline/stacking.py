@@ -17,7 +17,8 @@ from changedetect.models.cells import Cells
 from changedetect.models.lwpr import LWPRSurface
 from changedetect.models.pyramid import Lattice
 from changedetect.models.reference import ReferenceLWPR
-from changedetect.pipeline.pairs import alignment_terms, stable_cells
+from changedetect.pipeline.common_errors import common_terms, errors_apart, errors_between
+from changedetect.pipeline.pairs import stable_cells
 from changedetect.timeseries.deviations import EpochCells, LocalDeviation, estimate_deviation, learn_shared_surface
 from changedetect.timeseries.edges import EdgeFinder
 from changedetect.timeseries.errors import epoch_errors
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from changedetect.differencing.error_model import ErrorModel
     from changedetect.grid import Grid
     from changedetect.pipeline.learn import Model
+    from changedetect.timeseries.differences import TermsOfEpochs
     from changedetect.typing import FloatArray
 
 __all__ = ["EpochLoader", "add_errors", "stack_epochs"]
@@ -155,7 +157,7 @@ def _of_kind(model: object, kind: type[T], name: str) -> T:
 
 def add_errors(
     programme: Programme, epoch_ids: Sequence[str], stack: Stack, grid: Grid
-) -> tuple[list[ErrorModel], Callable[[int], list[CoherentTerm]]]:
+) -> tuple[list[ErrorModel], TermsOfEpochs]:
     """
     Errors of every epoch beyond the independent ones, as for the differences of pairs.
 
@@ -172,7 +174,8 @@ def add_errors(
     models : list of ErrorModel
         Correlated errors of each epoch, found on the programme's stable areas, or on ground found not to have changed.
     terms : callable
-        Gives, by the number of an epoch, what its alignment to the first epoch leaves.
+        Gives what whole epochs share, of alignments and of flights: for the number of one epoch its share of the
+        errors of all, as `errors_apart`; for two, earlier first, the errors of their difference.
     """
     stable = stable_cells(programme, grid)
     try:
@@ -183,10 +186,17 @@ def add_errors(
     seen = np.any(stack.observed, axis=0)
     elevation: FloatArray = np.where(seen, stack.terrain[0], np.nan)
 
-    def terms(epoch: int) -> list[CoherentTerm]:
-        return alignment_terms(programme, [epoch_ids[epoch]], elevation, grid) if seen.any() else []
+    apart = errors_apart(programme, epoch_ids)
+
+    def terms(epochs: tuple[int, ...]) -> list[CoherentTerm]:
+        if len(epochs) == 1:
+            errors = apart[epochs[0]]
+        else:
+            earlier, later = (epoch_ids[k] for k in epochs)
+            errors = errors_between(programme, earlier, later)
+        return common_terms(errors, elevation, grid) if errors and seen.any() else []
 
     for k in range(stack.n_epochs):
-        for term in terms(k):
+        for term in terms((k,)):
             stack.coherent[k] += term.variance(stack.shape).astype(np.float32)
     return models, terms

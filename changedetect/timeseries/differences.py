@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from changedetect.differencing.maps import ChangeMaps
     from changedetect.timeseries.stack import Stack
 
-__all__ = ["TermsOfEpoch", "epoch_maps", "pair_maps"]
+__all__ = ["TermsOfEpochs", "epoch_maps", "pair_maps"]
 
-#: Gives the coherent terms of an epoch, by its number.
-TermsOfEpoch: TypeAlias = Callable[[int], Sequence[CoherentTerm]]
+#: Gives the coherent terms of one epoch, apart from those of the others, or of the difference of two, by their numbers.
+TermsOfEpochs: TypeAlias = Callable[[tuple[int, ...]], Sequence[CoherentTerm]]
 
 
 def epoch_maps(
-    stack: Stack, models: Sequence[ErrorModel], terms: TermsOfEpoch, epoch: int, settings: DifferencingConfig
+    stack: Stack, models: Sequence[ErrorModel], terms: TermsOfEpochs, epoch: int, settings: DifferencingConfig
 ) -> ChangeMaps:
     """
     Deviation of one epoch from the shared surface with that epoch's errors alone.
@@ -34,7 +34,7 @@ def epoch_maps(
     stack : Stack
     models : sequence of ErrorModel
     terms : callable
-        Gives what alignment leaves of an epoch.
+        Gives errors that whole epochs share.
     epoch : int
         Its number.
     settings : DifferencingConfig
@@ -60,7 +60,7 @@ def epoch_maps(
 def pair_maps(
     stack: Stack,
     models: Sequence[ErrorModel],
-    terms: TermsOfEpoch,
+    terms: TermsOfEpochs,
     pair: tuple[int, int],
     settings: DifferencingConfig,
 ) -> ChangeMaps:
@@ -94,9 +94,9 @@ def pair_maps(
     return judge_change(evidence, _errors(stack, [models[k] for k in pair], terms, pair), settings)
 
 
-def _errors(stack: Stack, models: Sequence[ErrorModel], terms: TermsOfEpoch, epochs: Sequence[int]) -> CellErrors:
+def _errors(stack: Stack, models: Sequence[ErrorModel], terms: TermsOfEpochs, epochs: tuple[int, ...]) -> CellErrors:
     correlated = np.sum([np.asarray(stack.correlated[k], np.float64) for k in epochs], axis=0)
-    joined = tuple(term for k in epochs for term in terms(k))
+    joined = tuple(terms(epochs))
     coherent = np.zeros(stack.shape)
     for term in joined:
         coherent += term.variance(stack.shape)

@@ -9,7 +9,7 @@ import numpy as np
 
 from changedetect.differencing.areas import AreaBudget, area_budget, sum_std
 from changedetect.differencing.objects import find_objects_of_change
-from changedetect.timeseries.differences import TermsOfEpoch, epoch_maps, pair_maps
+from changedetect.timeseries.differences import TermsOfEpochs, epoch_maps, pair_maps
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,7 +54,7 @@ class AreaSeries:
 def area_series(
     stack: Stack,
     models: Sequence[ErrorModel],
-    terms: TermsOfEpoch,
+    terms: TermsOfEpochs,
     areas: Sequence[Area],
     settings: DifferencingConfig,
 ) -> AreaSeries:
@@ -67,7 +67,7 @@ def area_series(
     models : sequence of ErrorModel
         Of each epoch.
     terms : callable
-        Gives what alignment leaves of an epoch.
+        Gives errors that whole epochs share.
     areas : sequence of Area
     settings : DifferencingConfig
 
@@ -103,7 +103,7 @@ def area_series(
 def area_budgets(
     stack: Stack,
     models: Sequence[ErrorModel],
-    terms: TermsOfEpoch,
+    terms: TermsOfEpochs,
     pair: tuple[int, int],
     areas: Sequence[Area],
     settings: DifferencingConfig,
