@@ -17,6 +17,7 @@ __all__ = [
     "OutputError",
     "OutputExistsError",
     "TemporaryError",
+    "UsageError",
     "VerticalDatumError",
 ]
 
@@ -25,6 +26,12 @@ class ChangeDetectError(Exception):
     """Base of every error a user can act on; `exit_code` is what the command line returns."""
 
     exit_code = 1
+
+
+class UsageError(ChangeDetectError, ValueError):
+    """An argument is none that the command or function takes."""
+
+    exit_code = 2
 
 
 class ConfigError(ChangeDetectError, ValueError):

@@ -7,6 +7,8 @@ from datetime import date
 from pathlib import Path
 
 import numpy as np
+import pyogrio
+import shapely
 
 from changedetect.catalogue import Programme
 from changedetect.cli import main
@@ -62,6 +64,18 @@ def add_by_hand(directory: Path, epoch_id: str, **arguments) -> None:
 def reopen(programme: Programme, **arguments) -> Programme:
     """Read a programme again, as the next command would."""
     return Programme.open(programme.directory, environment={}, **arguments)
+
+
+def write_zones(path: Path, geometries, names=None, *, crs="EPSG:32632", layer="zones", column="name", append=False):
+    """Write geometries, None among them for a feature without one, as a GeoPackage."""
+    geometries = list(geometries)
+    names = [f"zone {k}" for k in range(len(geometries))] if names is None else list(names)
+    binary = np.array([None if g is None else shapely.to_wkb(g) for g in geometries], object)
+    columns = [np.array(names, object)]
+    pyogrio.raw.write(
+        path, binary, columns, [column], layer=layer, driver="GPKG", geometry_type="Unknown", crs=crs, append=append
+    )
+    return path
 
 
 def snapshot(directory: Path) -> dict[str, tuple[int, int]]:

@@ -17,8 +17,9 @@ from photogrammetry import rendered
 from typer.testing import CliRunner
 
 from changedetect.cli.app import app
-from changedetect.errors import InputDataError, MissingInputError, OutputExistsError
+from changedetect.errors import InputDataError, MissingInputError, OutputExistsError, UsageError
 from changedetect.navigation.frame import LocalFrame
+from changedetect.navigation.poses import CameraPoses
 from changedetect.photogrammetry.orientation import OrientationSettings
 from changedetect.photogrammetry.ties import TieSettings
 from changedetect.photogrammetry.tracks import TrackSettings
@@ -110,6 +111,28 @@ def test_points_are_written_with_sigma_and_views(source, finished, tmp_path, mon
         reconstruct([tmp_path], output, ReconstructOptions())
 
 
+def test_flights_whose_photos_have_the_same_names_keep_their_own(tmp_path, monkeypatch):
+    runs, truths = [], []
+    for k in range(2):
+        folder = tmp_path / f"flight{k}"
+        folder.mkdir()
+        flown = rendered.fly(k, n_photos=4)
+        for name, grey in zip(flown.truth.names, flown.photos, strict=True):
+            cv2.imwrite(str(folder / name), grey)
+        poses = rendered.perturbed(flown.truth, 100 + k)
+        paths = tuple(folder / name for name in poses.names)
+        runs.append(a_run(FlightSource(f"flight{k}", poses, rendered.CAMERA, paths, 0.0, {}), tmp_path / f"work{k}"))
+        truths.append(flown.truth.position)
+    monkeypatch.setattr(pipeline, "_runs", lambda *_: runs)  # logs are not part of this test
+    folders = [tmp_path / "flight0", tmp_path / "flight1"]
+    reconstruct(folders, tmp_path / "out", ReconstructOptions(crs="EPSG:32632+4979"))
+    for k, run in enumerate(runs):
+        found = CameraPoses.load(run.store.directory / "adjusted_poses.nc").position
+        own, other = (np.std(found - truth, axis=0)[:2].max() for truth in (truths[k], truths[1 - k]))
+        assert own < 0.12
+        assert other > 0.3
+
+
 def test_crs_is_the_users_then_the_sites_then_utm(tmp_path):
     south = LocalFrame(-33.89, 151.19, 40.0)
     assert output_crs(tmp_path, south, None) == "EPSG:32756+4979"
@@ -126,8 +149,10 @@ def test_a_folder_that_does_not_exist_ends_with_its_exit_code(tmp_path):
 
 
 def test_outputs_of_an_unknown_kind_and_flights_of_one_name_are_refused(tmp_path):
-    with pytest.raises(InputDataError, match=r"must end in \.laz or \.las"):
+    with pytest.raises(UsageError, match=r"points\.csv' ends in none of \.laz, \.las"):
         reconstruct([tmp_path], tmp_path / "points.csv", ReconstructOptions())
+    with pytest.raises(UsageError, match=r"points\.laz' looks like a file\. 2 flights"):
+        reconstruct([tmp_path / "a", tmp_path / "b"], tmp_path / "points.laz", ReconstructOptions())
     with pytest.raises(InputDataError, match="different names; given: a, a"):
         reconstruct([tmp_path / "x" / "a", tmp_path / "y" / "a"], tmp_path / "out", ReconstructOptions())
 

@@ -6,12 +6,11 @@ import csv
 
 import netCDF4
 import numpy as np
-import pyogrio
 import pytest
 import shapely
 import xarray as xr
 from numpy.testing import assert_allclose
-from small_surveys import BLOCK, SIDE, SOUTH, WEST, add_by_hand, make_programme, reopen, run, snapshot
+from small_surveys import BLOCK, SIDE, SOUTH, WEST, add_by_hand, make_programme, reopen, run, snapshot, write_zones
 from test_pipeline_real import real, survey  # noqa: F401
 
 from changedetect.cli import main
@@ -43,13 +42,7 @@ def zones(tmp_path_factory):
         "rim": shapely.box(WEST, SOUTH, WEST + 4.0, SOUTH + SIDE),
         "elsewhere": shapely.box(WEST + 5 * SIDE, SOUTH, WEST + 6 * SIDE, SOUTH + SIDE),
     }
-    path = tmp_path_factory.mktemp("zones") / "zones.gpkg"
-    geometry = np.array([shapely.to_wkb(box) for box in boxes.values()], object)
-    pyogrio.raw.write(
-        path, geometry, [np.array(list(boxes), object)], ["name"], driver="GPKG", geometry_type="Polygon",
-        crs="EPSG:32632",
-    )  # fmt: skip
-    return path
+    return write_zones(tmp_path_factory.mktemp("zones") / "zones.gpkg", boxes.values(), boxes)
 
 
 @pytest.fixture(scope="module")
@@ -184,11 +177,13 @@ def test_a_dry_run_checks_everything_and_writes_nothing(site, zones, tmp_path, c
     before = snapshot(tmp_path)
     done = run(capsys, "series", site, "-o", tmp_path / "s.nc", "--zones", zones, "--dry-run")
     assert (done["n_zones"], len(done["epochs"])) == (3, 6)
+    assert any("zone 'elsewhere' lies outside" in text for text in done["warnings"])
     assert snapshot(tmp_path) == before
 
 
 def test_what_cannot_be_meant_is_refused(site, zones, tmp_path, capsys):
-    run(capsys, "series", site, "-o", tmp_path / "s.tif", expect=65)
+    done = run(capsys, "series", site, "-o", tmp_path / "s.tif", expect=2)
+    assert "s.tif' ends in none of .nc" in done["error"]["message"]
     run(capsys, "series", site, "-o", tmp_path / "s.nc", "--zones", tmp_path / "none.gpkg", expect=66)
     run(capsys, "series", tmp_path / "nowhere", "-o", tmp_path / "s.nc", expect=66)
     (tmp_path / "s.nc").write_text("kept")
@@ -200,6 +195,29 @@ def test_what_cannot_be_meant_is_refused(site, zones, tmp_path, capsys):
     run(capsys, "series", site, "-o", tmp_path / "file" / "s.nc", expect=73)
     done = run(capsys, "series", site, "-o", tmp_path / "u.nc", "--bounds", 5, 1, 0, 1, expect=78)
     assert "west" in done["error"]["message"]
+
+
+def test_bounds_away_from_the_data_are_refused(site, tmp_path, capsys):
+    away = (WEST + 100, WEST + 120, SOUTH, SOUTH + SIDE)
+    for words in ((), ("--dry-run",)):
+        done = run(capsys, "series", site, "-o", tmp_path / "s.nc", "--bounds", *away, *words, expect=78)
+        message = done["error"]["message"]
+        assert f"easting {away[0]:.1f} to {away[1]:.1f}" in message
+        assert f"the data span easting {WEST:.1f}" in message
+    done = run(capsys, "surface", site, DATES[0], "-o", tmp_path / "s.tif", "--bounds", *away, expect=78)
+    assert "--bounds" in done["error"]["message"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_bounds_in_a_gap_of_all_data_are_refused(tmp_path, capsys):
+    programme = make_programme(
+        tmp_path / "site", {DATES[0]: {}, DATES[1]: {"shift": 60.0}}, coregistration={"enabled": False}
+    )
+    run(capsys, "update", programme.directory)
+    gap = (WEST + 35, WEST + 45, SOUTH, SOUTH + SIDE)
+    done = run(capsys, "series", programme.directory, "-o", tmp_path / "s.nc", "--bounds", *gap, expect=65)
+    assert "a gap in all data" in done["error"]["message"]
+    assert [path.name for path in tmp_path.iterdir()] == ["site"]
 
 
 def test_one_epoch_is_no_series(tmp_path, capsys):

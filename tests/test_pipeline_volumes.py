@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import csv
 
-import numpy as np
-import pyogrio
 import pytest
 import shapely
-from small_surveys import SIDE, SOUTH, WEST, make_programme, reopen, run, snapshot
+from small_surveys import SIDE, SOUTH, WEST, make_programme, reopen, run, snapshot, write_zones
 
 from changedetect.cli import main
 from changedetect.pipeline.learn import ModelShelf
@@ -34,13 +32,7 @@ def zones(tmp_path_factory):
         "east": shapely.box(WEST + half, SOUTH, WEST + SIDE, SOUTH + SIDE),
         "elsewhere": shapely.box(WEST + 5 * SIDE, SOUTH, WEST + 6 * SIDE, SOUTH + SIDE),
     }
-    path = tmp_path_factory.mktemp("zones") / "zones.gpkg"
-    geometry = np.array([shapely.to_wkb(box) for box in boxes.values()], object)
-    pyogrio.raw.write(
-        path, geometry, [np.array(list(boxes), object)], ["name"], driver="GPKG", geometry_type="Polygon",
-        crs="EPSG:32632",
-    )  # fmt: skip
-    return path
+    return write_zones(tmp_path_factory.mktemp("zones") / "zones.gpkg", boxes.values(), boxes)
 
 
 def test_the_volumes_of_the_command_are_those_of_the_summary(site, capsys):
@@ -90,17 +82,17 @@ def test_a_dry_run_checks_the_zones_and_writes_nothing(site, zones, capsys, tmp_
 def test_what_cannot_be_meant_is_refused(site, capsys, tmp_path):
     run(capsys, "volume", site, FIRST, SECOND, "--bands", 0, expect=2)
     run(capsys, "volume", site, FIRST, "2030-01-01", expect=66)
+    done = run(capsys, "volume", site, FIRST, SECOND, "-o", tmp_path / "v.txt", expect=2)
+    assert "v.txt' ends in none of .csv, .gpkg" in done["error"]["message"]
+    done = run(capsys, "volume", site, FIRST, SECOND, "-o", tmp_path / "v.gpkg", expect=2)
+    assert "--zones" in done["error"]["message"]
     (tmp_path / "v.csv").write_text("kept")
     run(capsys, "volume", site, FIRST, SECOND, "-o", tmp_path / "v.csv", expect=73)
     assert (tmp_path / "v.csv").read_text() == "kept"
 
 
 def stable_site(folder, box):
-    path = folder / "stable.gpkg"
-    pyogrio.raw.write(
-        path, np.array([shapely.to_wkb(box)], object), [np.array(["road"], object)], ["name"], driver="GPKG",
-        geometry_type="Polygon", crs="EPSG:32632",
-    )  # fmt: skip
+    path = write_zones(folder / "stable.gpkg", [box], ["road"])
     programme = make_programme(folder / "site", {FIRST: {}, SECOND: {"step": 0.5}})
     assert update(programme).exit_code == 0
     text = (programme.directory / "programme.toml").read_text()

@@ -342,6 +342,6 @@ def check_located(crs: CRS, text: str) -> None:
         what = "is a local system without a place on Earth"
     msg = (
         f"The coordinate reference system {brief(text)!r} {what}. Use a projected one such as EPSG:32632, or "
-        "longitude and latitude (EPSG:4326, EPSG:4979) for a source; state a source's with --crs."
+        "longitude and latitude (EPSG:4326, EPSG:4979) for a source."
     )
     raise CRSMismatchError(msg)

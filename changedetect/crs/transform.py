@@ -72,6 +72,8 @@ class PointTransform:
         transforms heights together with the position.
     coordinate_epoch : float or None, decimal year
         Epoch of the coordinates, for transformations from dynamic frames (ITRF).
+    has_heights : bool
+        False for outlines on the map.
 
     Notes
     -----
@@ -83,6 +85,7 @@ class PointTransform:
     target: str
     height_factor: float | None = 1.0
     coordinate_epoch: float | None = None
+    has_heights: bool = True
     _transformer: Transformer | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -151,7 +154,11 @@ class PointTransform:
         first = int(np.argmin(reached))
         place = ", ".join(f"{array[first]!s}" for array in arrays[: 3 if self.height_factor is None else 2])
         grids = _missing_grids(self.source, self.target)
-        fix = "Check the CRS of the source (--crs), the order of its columns, and their units."
+        fix = (
+            "Check the CRS of the source (--crs), the order of its columns, and their units."
+            if self.has_heights
+            else "Check the CRS that the file states; GeoJSON is in longitude and latitude."
+        )
         if grids:
             fix += f" If they are right, {_install(grids)}"
         msg = (
@@ -207,24 +214,25 @@ def make_transform(
     factor = height_ratio(vertical_crs(source_crs), vertical_crs(target_crs)) if has_heights else 1.0
     transformer = None
     if factor is None:
-        transformer = _find_transformer(source_crs, target_crs, source, target)
+        transformer = _find_transformer(source_crs, target_crs, source, target, has_heights=has_heights)
     elif not is_same_horizontal(source, target):
-        transformer = _find_transformer(horizontal_crs(source_crs), horizontal_crs(target_crs), source, target)
-    transform = PointTransform(source, target, factor, coordinate_epoch, transformer)
+        parts = horizontal_crs(source_crs), horizontal_crs(target_crs)
+        transformer = _find_transformer(*parts, source, target, has_heights=has_heights)
+    transform = PointTransform(source, target, factor, coordinate_epoch, has_heights, transformer)
     if transformer is not None and transformer.accuracy != -1:  # one candidate: judged before any point is read
         _check_operation(transform, transformer)
     return transform
 
 
-def _find_transformer(first: CRS, second: CRS, source: str, target: str) -> Transformer:
+def _find_transformer(first: CRS, second: CRS, source: str, target: str, *, has_heights: bool) -> Transformer:
     set_network_enabled(active=False)
     try:
         return Transformer.from_crs(first, second, always_xy=True, allow_ballpark=False)
     except ProjError as error:
-        raise _no_way(source, target) from error
+        raise _no_way(source, target, has_heights=has_heights) from error
 
 
-def _no_way(source: str, target: str) -> InputDataError:
+def _no_way(source: str, target: str, *, has_heights: bool) -> InputDataError:
     source_crs, target_crs = parse_crs(source), parse_crs(target)
     vertical = height_ratio(vertical_crs(source_crs), vertical_crs(target_crs)) is None
     grids = _missing_grids(source, target)
@@ -236,10 +244,9 @@ def _no_way(source: str, target: str) -> InputDataError:
             f"Or transform the source beforehand. If its heights already refer to the programme's datum, {heights_hint}"
         )
         return VerticalDatumError(msg)
-    msg = (
-        f"Coordinates cannot be transformed from {crs_name(source)!r} to {crs_name(target)!r}; {way} "
-        f"If the source's coordinates already refer to the programme's CRS, state it: --crs {brief(target)}."
-    )
+    msg = f"Coordinates cannot be transformed from {crs_name(source)!r} to {crs_name(target)!r}; {way}"
+    if has_heights:
+        msg += f" If the source's coordinates already refer to the programme's CRS, state it: --crs {brief(target)}."
     return CRSMismatchError(msg)
 
 

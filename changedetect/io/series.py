@@ -67,7 +67,7 @@ TIME_LAYERS = {
         "standard deviation of the error of this epoch's own surface",
         "m",
         "Errors of different epochs are independent: the change between any two epochs has the sum of their squares as "
-        "variance. What all epochs share is not in it; what only some share is, so that no variance comes out too small.",
+        "variance. What all epochs share is not in it; what some share is, so that no variance comes out too small.",
     ),
     "observed": Layer("whether the epoch observed the ground", "1", standard_name="status_flag"),
     "n_observations": Layer("effective number of observations", "1", standard_name="number_of_observations"),

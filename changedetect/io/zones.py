@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pyogrio
@@ -13,7 +13,7 @@ from pyogrio.errors import DataLayerError, DataSourceError
 from rasterio.features import rasterize
 from rasterio.transform import Affine
 
-from changedetect.crs import horizontal_part, make_transform
+from changedetect.crs import PointTransform, crs_name, horizontal_part, make_transform
 from changedetect.errors import CRSMismatchError, InputDataError, MissingInputError
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ __all__ = ["Zone", "covered_cells", "read_zones"]
 
 #: Columns a zone's name is taken from, the first that exists; upper and lower case are the same.
 _NAME_COLUMNS = ("name", "zone", "label", "title", "id", "location")
+AnyPolygon: TypeAlias = shapely.Polygon | shapely.MultiPolygon
 _FIX = "Open the file in QGIS, run 'Fix geometries' or delete the feature, and save it again."
 
 
@@ -41,7 +42,7 @@ class Zone:
     """
 
     name: str
-    polygon: shapely.Polygon | shapely.MultiPolygon
+    polygon: AnyPolygon
 
 
 def read_zones(path: Path, crs: str, *, layer: str | None = None, name_column: str | None = None) -> tuple[Zone, ...]:
@@ -88,31 +89,53 @@ def read_zones(path: Path, crs: str, *, layer: str | None = None, name_column: s
     if not path.exists():
         msg = f"'{path}' does not exist. Name a GeoPackage, GeoJSON or shapefile with polygons."
         raise MissingInputError(msg)
-    meta, geometries, columns = _read(path, _only_layer(path, layer))
+    layer = _only_layer(path, layer)
+    meta, geometries, columns = _read(path, layer)
+    where = f"'{path}'" if layer is None else f"'{path}', layer '{layer}'"
     source = meta["crs"]
     if source is None:
-        msg = f"'{path}' states no coordinate reference system. Assign one in QGIS (Layer > Set CRS) and save it."
+        msg = f"{where} states no coordinate reference system. Assign one in QGIS (Layer > Set CRS) and save it."
         raise CRSMismatchError(msg)
     if len(geometries) == 0:
-        msg = f"'{path}' holds no features; polygons are expected."
+        msg = f"{where} holds no features; polygons are expected. Draw them in QGIS, or name another file."
         raise InputDataError(msg)
-    transform = make_transform(horizontal_part(source), horizontal_part(crs), has_heights=False)
-
-    def projected(vertices: FloatArray) -> FloatArray:
-        easting, northing, _ = transform(vertices[:, 0], vertices[:, 1], np.zeros(len(vertices)))
-        return np.column_stack([easting, northing])
-
-    names = _names(path, list(meta["fields"]), columns, len(geometries), name_column)
+    names = _names(where, list(meta["fields"]), columns, len(geometries), name_column)
+    transform = _way(where, source, crs)
     zones = []
     for number, (name, binary) in enumerate(zip(names, geometries, strict=True), start=1):
-        polygon = _checked(path, number, name, binary)
-        zones.append(Zone(name, shapely.transform(polygon, projected)))
+        what = f"{where}: feature {number} ('{name}')"
+        zones.append(Zone(name, _projected(what, _checked(what, binary), transform)))
     return tuple(zones)
 
 
-def covered_cells(
-    polygon: shapely.Polygon | shapely.MultiPolygon, grid: Grid
-) -> tuple[tuple[slice, slice], BoolArray] | None:
+def _way(where: str, source: str, crs: str) -> PointTransform:
+    """From the CRS of the zones to the programme's."""
+    try:
+        return make_transform(horizontal_part(source), horizontal_part(crs), has_heights=False)
+    except InputDataError as error:
+        msg = f"{where}: {error} {_save_as(crs)}"
+        raise CRSMismatchError(msg) from error
+
+
+def _projected(what: str, polygon: AnyPolygon, transform: PointTransform) -> AnyPolygon:
+    def moved(vertices: FloatArray) -> FloatArray:
+        easting, northing, _ = transform(vertices[:, 0], vertices[:, 1], np.zeros(len(vertices)))
+        return np.column_stack([easting, northing])
+
+    try:
+        return shapely.transform(polygon, moved)
+    except InputDataError as error:
+        msg = f"{what}: {error} {_save_as(transform.target)}"
+        raise CRSMismatchError(msg) from error
+
+
+def _save_as(crs: str) -> str:
+    return (
+        f"Or save the zones in the programme's CRS, {crs_name(crs)} (QGIS: Export > Save Features As), and name those."
+    )
+
+
+def covered_cells(polygon: AnyPolygon, grid: Grid) -> tuple[tuple[slice, slice], BoolArray] | None:
     """
     Cells of a grid whose centres lie in a polygon.
 
@@ -140,6 +163,7 @@ def covered_cells(
 
 
 def _only_layer(path: Path, layer: str | None) -> str | None:
+    """Layer to read; None for a file that has but one and gives it its own name."""
     try:
         available = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
     except DataSourceError as error:
@@ -147,13 +171,15 @@ def _only_layer(path: Path, layer: str | None) -> str | None:
         raise InputDataError(msg) from error
     if layer is None and len(available) > 1:
         msg = (
-            f"'{path}' has {len(available)} layers ({', '.join(available)}); save the one to use in a file of its own."
+            f"'{path}' has {len(available)} layers ({', '.join(available)}). Name one (--layer), or save it in a file "
+            "of its own."
         )
         raise InputDataError(msg)
     if layer is not None and layer not in available:
-        msg = f"'{path}' has no layer '{layer}'; it has {', '.join(available) or 'none'}."
+        msg = f"'{path}' has no layer '{layer}'; it has {', '.join(available) or 'none with geometries'}."
         raise InputDataError(msg)
-    return layer
+    only = available[0] if len(available) == 1 else None
+    return layer or (None if only == path.stem else only)
 
 
 def _read(path: Path, layer: str | None) -> tuple[dict[str, Any], Any, list[Any]]:
@@ -168,10 +194,10 @@ def _read(path: Path, layer: str | None) -> tuple[dict[str, Any], Any, list[Any]
     return meta, geometries, list(columns)
 
 
-def _names(path: Path, fields: list[str], columns: list[Any], n: int, name_column: str | None) -> list[str]:
+def _names(where: str, fields: list[str], columns: list[Any], n: int, name_column: str | None) -> list[str]:
     """One name a feature, made unique by its number where it occurs twice or is missing."""
     if name_column is not None and name_column not in fields:
-        msg = f"'{path}' has no column '{name_column}'; it has {', '.join(fields) or 'none'}."
+        msg = f"{where} has no column '{name_column}'; it has {', '.join(fields) or 'none'}."
         raise InputDataError(msg)
     lower = [field.lower() for field in fields]
     found = name_column or next((fields[lower.index(c)] for c in _NAME_COLUMNS if c in lower), None)
@@ -181,9 +207,12 @@ def _names(path: Path, fields: list[str], columns: list[Any], n: int, name_colum
     return [name if name and names.count(name) == 1 else f"{name} {k}".strip() for k, name in enumerate(names, start=1)]
 
 
-def _checked(path: Path, number: int, name: str, binary: bytes | None) -> shapely.Polygon | shapely.MultiPolygon:
-    geometry = None if binary is None else shapely.force_2d(shapely.from_wkb(binary))
-    what = f"'{path}': feature {number} ('{name}')"
+def _checked(what: str, binary: bytes | None) -> AnyPolygon:
+    try:
+        geometry = None if binary is None else shapely.force_2d(shapely.from_wkb(binary))
+    except shapely.errors.GEOSException as error:
+        msg = f"{what} cannot be read: {error}. {_FIX}"
+        raise InputDataError(msg) from error
     if geometry is None or geometry.is_empty:
         msg = f"{what} has no geometry. {_FIX}"
         raise InputDataError(msg)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from changedetect.catalogue import Programme
 from changedetect.errors import ConfigError
-from changedetect.pipeline.queries import require_absent
+from changedetect.pipeline.queries import require_absent, require_suffix
 from changedetect.pipeline.reading import read_epoch_points
 from changedetect.pipeline.update import Progress
 from changedetect.typing import JSONObject
@@ -67,6 +67,8 @@ def compare_epoch(
         The epoch or its sources cannot be used, or there are too few points.
     ConfigError
         A name is unknown, an option is out of range, or a package that was asked for is missing.
+    UsageError
+        The plot does not end in ``.png``.
     OutputExistsError
         The plot exists and `overwrite` is not set.
     """
@@ -74,6 +76,7 @@ def compare_epoch(
     epoch = programme.epoch(epoch_id)
     chosen = _chosen(programme, names)
     if plot is not None:
+        require_suffix(plot, (".png",), "The plot is a PNG picture.")
         require_plotting()
         require_absent(plot, overwrite=overwrite)
     cloud = read_epoch_points(programme, epoch).cloud

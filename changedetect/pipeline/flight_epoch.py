@@ -32,7 +32,7 @@ from changedetect.pipeline.flight_run import FlightRun, default_workers, read_fl
 from changedetect.pipeline.flight_store import FlightStore, load_finished, save_finished
 from changedetect.pipeline.manifest import utc_now
 from changedetect.pipeline.photo_clock import with_camera_in_time
-from changedetect.pipeline.reconstruct import ReconstructOptions, warn_of_contradiction, write_flight
+from changedetect.pipeline.reconstruct import FlightPart, ReconstructOptions, warn_of_contradiction, write_flight
 from changedetect.storage import atomic_directory, sha256_of_file, write_json
 from changedetect.typing import FloatArray, JSONObject
 
@@ -129,7 +129,7 @@ def reconstruct_epoch(
     options = ReconstructOptions(dense=config.flights.dense)
     with atomic_directory(programme.flight_directory(epoch.epoch_id) / POINTS_FOLDER) as folder:
         points, described = write_flight(
-            run, folder / POINTS_FILE, finished.adjustment, everything, config.crs, options
+            run, folder / POINTS_FILE, FlightPart(finished.adjustment, everything), config.crs, options
         )
         described["file"] = POINTS_FILE
         save_finished(folder / _ORIENTATION_FILE, finished)

@@ -134,6 +134,14 @@ def _described(programme: Programme, source: Source) -> Source:
     """Return the source with its checksum, its path as the programme is to remember it."""
     path = Path(source.uri).expanduser().resolve()
     if path.is_dir():
+        flights = [folder.name for folder in sorted(path.iterdir()) if is_flight_folder(folder)]
+        if flights:
+            msg = (
+                f"'{source.uri}' holds {'flights' if len(flights) > 1 else 'a flight'} in folders: "
+                f"{', '.join(flights)}. A flight is an epoch of its own; add each by itself: changedetect add "
+                f"{programme.directory} EPOCH_ID {Path(source.uri) / flights[0]}"
+            )
+            raise InputDataError(msg)
         msg = (
             f"'{source.uri}' is a folder. Name the files in it, for example {source.uri}/*.laz. (The folder of a "
             "flight holds photos, and imu.csv and gps.csv or a PX4 log.)"

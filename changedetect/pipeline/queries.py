@@ -13,18 +13,21 @@ from pathlib import Path
 import numpy as np
 
 from changedetect.catalogue import MANIFEST_FILE, Programme, plan
-from changedetect.errors import InputDataError, MissingInputError, OutputExistsError
+from changedetect.errors import InputDataError, MissingInputError, OutputExistsError, UsageError
 from changedetect.io.cog import write_cog
 from changedetect.io.netcdf import SURFACE_LAYERS, SurfaceMetadata, write_surface
 from changedetect.pipeline.learn import ModelShelf
 from changedetect.pipeline.manifest import new_run_id, utc_now
 from changedetect.pipeline.places import iter_coordinates
 from changedetect.pipeline.products import make_pair_products, predict_layers, product_grid
+from changedetect.pipeline.regions import describe_region
 from changedetect.storage import atomic_path
 from changedetect.typing import JSONObject, Region
 
 __all__ = ["difference_epochs", "predict_table", "require_model", "write_epoch_surface"]
 
+#: Endings that nobody gives a folder.
+_FILE_SUFFIXES = (".tif", ".tiff", ".nc", ".csv", ".json", ".gpkg", ".geojson", ".shp", ".laz", ".las", ".png", ".txt")
 #: Columns that `predict_table` writes after easting and northing.
 PREDICTED_COLUMNS = ("elevation", "elevation_std", "noise_std", "n_effective")
 
@@ -78,11 +81,14 @@ def predict_table(
 
     Raises
     ------
+    UsageError
+        The output does not end in ``.csv``.
     MissingInputError, InputDataError
         The table or the model is missing; the table holds something else than numbers: the message names the line.
     OutputExistsError
         The output exists.
     """
+    require_suffix(output, (".csv",), "Predictions are written as a CSV table.")
     require_absent(output, overwrite=overwrite)
     model = ModelShelf(programme).get(epoch_id)
     header = ("easting", "northing", *PREDICTED_COLUMNS)
@@ -133,14 +139,16 @@ def write_epoch_surface(
 
     Raises
     ------
+    UsageError
+        The file's suffix is not known.
+    ConfigError
+        Resolution or bounds enclose nothing, or the bounds no data.
     InputDataError
-        The file's suffix or the layer is not known.
+        The epoch observed nothing of the ground in the bounds.
     OutputExistsError
         The output exists.
     """
-    if output.suffix.lower() not in {".tif", ".tiff", ".nc"}:
-        msg = f"'{output}' ends neither in .tif (one layer) nor in .nc (all layers)."
-        raise InputDataError(msg)
+    require_suffix(output, (".tif", ".tiff", ".nc"), "GeoTIFF holds one layer, NetCDF all of them.")
     require_absent(output, overwrite=overwrite)
     config, epoch = programme.config, programme.epoch(epoch_id)
     model = ModelShelf(programme).get(epoch_id)
@@ -149,6 +157,12 @@ def write_epoch_surface(
     if dry_run:
         return details
     layers = predict_layers(model, grid)
+    if not np.isfinite(layers["elevation"]).any():
+        msg = (
+            f"Epoch '{epoch_id}' observed nothing in {describe_region(grid.region)}, a gap in its data, which span "
+            f"{describe_region(model.region)} in {config.crs}. Choose other bounds."
+        )
+        raise InputDataError(msg)
     meta = SurfaceMetadata(
         programme=config.name,
         run_id=new_run_id(),
@@ -195,14 +209,42 @@ def difference_epochs(
 
     Raises
     ------
+    UsageError
+        The folder has the name of a file.
     OutputExistsError
         The folder holds something else, or `overwrite` is not set.
     """
+    require_suffix(directory, (), "A difference is written as a folder of maps.")
     require_replaceable(directory, overwrite=overwrite)
     pair = programme.pair(earlier, later)
     if dry_run:
         return {"directory": str(directory)}
     return make_pair_products(programme, pair, ModelShelf(programme), new_run_id(), directory)
+
+
+def require_suffix(output: Path, suffixes: Sequence[str], content: str) -> None:
+    """
+    Refuse a file whose name promises another format than is written.
+
+    Parameters
+    ----------
+    output : Path
+    suffixes : sequence of str
+        Allowed endings, lower case with their dots; none where a folder is written.
+    content : str
+        What is written, to begin a sentence with.
+
+    Raises
+    ------
+    UsageError
+    """
+    suffix = output.suffix.lower()
+    if suffixes and suffix not in suffixes:
+        msg = f"'{output}' ends in none of {', '.join(suffixes)}. {content}"
+        raise UsageError(msg)
+    if not suffixes and suffix in _FILE_SUFFIXES:
+        msg = f"'{output}' looks like a file. {content} Name a folder."
+        raise UsageError(msg)
 
 
 def require_absent(output: Path, *, overwrite: bool) -> None:

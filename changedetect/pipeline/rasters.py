@@ -9,6 +9,7 @@ from changedetect.errors import ConfigError
 from changedetect.grid import Grid
 from changedetect.io.netcdf import SURFACE_LAYERS
 from changedetect.models.base import SurfaceModel
+from changedetect.pipeline.regions import common_ground, describe_region
 from changedetect.typing import FloatArray, Region
 
 __all__ = ["predict_layers", "product_grid"]
@@ -31,7 +32,8 @@ def product_grid(
     Raises
     ------
     ConfigError
-        Resolution or bounds enclose nothing, or the raster would be too large to be meant.
+        Resolution or bounds enclose nothing, the bounds no part of `region`, or the raster would be too large to be
+        meant.
     """
     cell = config.resolution if resolution is None else resolution
     west, east, south, north = bounds or config.bounds or region
@@ -40,6 +42,13 @@ def product_grid(
         raise ConfigError(msg)
     if not (west < east and south < north):
         msg = f"Bounds are west east south north with west < east and south < north, not {west} {east} {south} {north}."
+        raise ConfigError(msg)
+    if common_ground((west, east, south, north), region) is None:
+        which = "Bounds given (--bounds)" if bounds else "The bounds in programme.toml"
+        msg = (
+            f"{which} hold no data: they are {describe_region((west, east, south, north))}, the data span "
+            f"{describe_region(region)} in {config.crs}. Give west east south north in this CRS, or leave them out."
+        )
         raise ConfigError(msg)
     n_cells = (east - west) * (north - south) / cell**2
     if n_cells > _MAX_CELLS:

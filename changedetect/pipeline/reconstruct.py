@@ -34,12 +34,20 @@ from changedetect.pipeline.flight_run import (
 )
 from changedetect.pipeline.flight_store import FlightStore
 from changedetect.pipeline.photo_clock import with_camera_in_time
-from changedetect.pipeline.queries import require_absent
+from changedetect.pipeline.queries import require_absent, require_suffix
 from changedetect.pointcloud import PointCloud
 from changedetect.storage import write_json
 from changedetect.typing import FloatArray, IntArray, JSONObject
 
-__all__ = ["FlightPoints", "ReconstructOptions", "output_crs", "reconstruct", "warn_of_contradiction", "write_flight"]
+__all__ = [
+    "FlightPart",
+    "FlightPoints",
+    "ReconstructOptions",
+    "output_crs",
+    "reconstruct",
+    "warn_of_contradiction",
+    "write_flight",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -89,6 +97,30 @@ class ReconstructOptions:
 
 
 @dataclass(frozen=True)
+class FlightPart:
+    """
+    What belongs to one flight in an adjustment that may hold several.
+
+    Attributes
+    ----------
+    adjustment : Adjustment
+    points : array of int
+        Numbers of the flight's points.
+    flight : int
+        Its number in the block: photos of two flights may have the same names.
+    """
+
+    adjustment: Adjustment
+    points: IntArray
+    flight: int = 0
+
+    @property
+    def images(self) -> IntArray:
+        """Positions of the flight's photos in the block."""
+        return np.flatnonzero(self.adjustment.block.flight == self.flight)
+
+
+@dataclass(frozen=True)
 class FlightPoints:
     """
     Points of one flight.
@@ -132,6 +164,8 @@ def reconstruct(
     ------
     InputDataError, MissingInputError
         A flight cannot be used; the message names the file and the fix.
+    UsageError
+        The output is no LAS or LAZ file for one flight, or looks like a file for several.
     ConfigError
         Options that exclude each other.
     CRSMismatchError, VerticalDatumError
@@ -172,13 +206,13 @@ def reconstruct(
         folders = zip(runs, directories, strict=True)
         runs = [with_camera_in_time(run, path, camera_file=options.camera_file) for run, path in folders]
     together, parts = _oriented(runs, options)
-    for run, (adjustment, _) in zip(runs, parts, strict=True):
-        warn_of_contradiction(run, adjustment)
-    for run, file, (adjustment, chosen) in zip(runs, files, parts, strict=True):
-        _, described = write_flight(run, file, adjustment, chosen, crs, options)
+    for run, part in zip(runs, parts, strict=True):
+        warn_of_contradiction(run, part.adjustment)
+    for run, file, part in zip(runs, files, parts, strict=True):
+        _, described = write_flight(run, file, part, crs, options)
         report["flights"].append(described)
         if options.method == "adjusted":
-            _adjusted_poses(run, adjustment).save(run.store.directory / "adjusted_poses.nc")
+            _adjusted_poses(run, part).save(run.store.directory / "adjusted_poses.nc")
     if runs[0].control and together is None:
         agreement = runs[0].controlled[1]
         report["control"] = None if agreement is None else agreement.describe()
@@ -190,7 +224,7 @@ def reconstruct(
 
 
 def write_flight(
-    run: FlightRun, file: Path, adjustment: Adjustment, chosen: IntArray, crs: str, options: ReconstructOptions
+    run: FlightRun, file: Path, part: FlightPart, crs: str, options: ReconstructOptions
 ) -> tuple[FlightPoints, JSONObject]:
     """
     Write the points of an adjusted flight.
@@ -200,9 +234,7 @@ def write_flight(
     run : FlightRun
     file : path
         LAS or LAZ.
-    adjustment : Adjustment
-    chosen : array of int
-        Numbers of the flight's points.
+    part : FlightPart
     crs : str
         Of the points.
     options : ReconstructOptions
@@ -214,11 +246,11 @@ def write_flight(
     described : dict
         For a report.
     """
-    points = _points(run, adjustment, chosen, crs, options)
+    points = _points(run, part, crs, options)
     file.parent.mkdir(parents=True, exist_ok=True)
     extra = {"n_views": (points.n_views.astype(np.uint8), "photos the point was seen in")}
     write_points(file, points.cloud, crs, extra=extra)
-    return points, _describe_source(run, file) | _describe_result(run, adjustment, chosen, points)
+    return points, _describe_source(run, file) | _describe_result(run, part, points)
 
 
 def output_crs(directory: Path, origin: LocalFrame, stated: str | None) -> str:
@@ -253,10 +285,9 @@ def output_crs(directory: Path, origin: LocalFrame, stated: str | None) -> str:
 
 def _output_files(directories: Sequence[Path], output: Path) -> list[Path]:
     if len(directories) == 1:
-        if output.suffix.lower() not in (".las", ".laz"):
-            msg = f"'{output}' must end in .laz or .las."
-            raise InputDataError(msg)
+        require_suffix(output, (".laz", ".las"), "Points are written as LAZ or LAS.")
         return [output]
+    require_suffix(output, (), f"{len(directories)} flights are written into a folder, each as NAME.laz.")
     names = [directory.resolve().name for directory in directories]
     if len(set(names)) < len(names):
         msg = f"Flights adjusted together need folders of different names; given: {', '.join(names)}."
@@ -326,35 +357,32 @@ def _named(on_step: Step, name: str) -> Step:
     return step
 
 
-def _oriented(
-    runs: list[FlightRun], options: ReconstructOptions
-) -> tuple[OrientedTogether | None, list[tuple[Adjustment, IntArray]]]:
-    """Adjustment and numbers of the points of every flight."""
+def _oriented(runs: list[FlightRun], options: ReconstructOptions) -> tuple[OrientedTogether | None, list[FlightPart]]:
+    """Adjustment of every flight, or of all together."""
     if options.method is not None and options.method != "adjusted":
         results = [run.unadjusted(options.method) for run in runs]
-        return None, [(result, np.arange(len(result.points))) for result in results]
+        return None, [FlightPart(result, np.arange(len(result.points))) for result in results]
     if options.calibrate:
         runs[:] = [run.calibrated() for run in runs]
     if len(runs) == 1:
         result, _ = runs[0].controlled
         n_own = runs[0].oriented.observations.n_points - len(runs[0].control)
-        return None, [(result, np.flatnonzero(result.origin < n_own))]
+        return None, [FlightPart(result, np.flatnonzero(result.origin < n_own))]
     names = tuple(run.source.label for run in runs)
     flights = [(run.block, run.information, run.features, run.matching, run.oriented) for run in runs]
     apart = float(np.sqrt(2.0) * max(run.offset_std for run in runs))
     together = orient_together(flights, names, apart, runs[0].settings, on_step=runs[0].on_step)
-    return together, [(together.adjustment, points) for points in together.points]
+    return together, [FlightPart(together.adjustment, points, k) for k, points in enumerate(together.points)]
 
 
-def _points(
-    run: FlightRun, adjustment: Adjustment, chosen: IntArray, crs: str, options: ReconstructOptions
-) -> FlightPoints:
+def _points(run: FlightRun, part: FlightPart, crs: str, options: ReconstructOptions) -> FlightPoints:
     """Points of a flight in the CRS, those of the adjustment or one for every cell of a fine grid."""
+    adjustment, chosen = part.adjustment, part.points
     uncertainty = point_uncertainty(adjustment, chosen)
     places, sigma = adjustment.points[chosen], uncertainty.sigma
     n_views = adjustment.observations.n_views[chosen]
     if options.dense:
-        found = _dense(run, adjustment, chosen)
+        found = _dense(run, part)
         places, n_views = found.points, found.n_views
         sigma = np.hypot(found.sigma, uncertainty.sigma_shared[found.nearest])
     geodetic = run.origin.to_geodetic(places)
@@ -367,8 +395,8 @@ def _points(
     return FlightPoints(cloud, n_views[usable], uncertainty)
 
 
-def _dense(run: FlightRun, adjustment: Adjustment, chosen: IntArray) -> DensePoints:
-    mine = _images_of(run, adjustment)
+def _dense(run: FlightRun, part: FlightPart) -> DensePoints:
+    adjustment = part.adjustment
     observations = adjustment.observations
     is_track = observations.kind == TRACK
     sigma = float(np.median(observations.sigma[is_track if is_track.any() else slice(None)]))
@@ -379,8 +407,8 @@ def _dense(run: FlightRun, adjustment: Adjustment, chosen: IntArray) -> DensePoi
 
     return dense_points(
         run.photos,
-        adjustment.block.select(mine),
-        adjustment.points[chosen],
+        adjustment.block.select(part.images),
+        adjustment.points[part.points],
         sigma,
         run.block.ground_sample_distance(run.matching.ground),
         workers=run.settings.workers,
@@ -400,17 +428,9 @@ def warn_of_contradiction(run: FlightRun, adjustment: Adjustment) -> None:
         )
 
 
-def _images_of(run: FlightRun, adjustment: Adjustment) -> IntArray:
-    """Positions of a flight's photos in an adjustment that may hold several flights."""
-    names = run.block.names
-    all_names = adjustment.block.names
-    first = next(k for k in range(len(all_names)) if all_names[k : k + len(names)] == names)
-    return np.arange(first, first + len(names))
-
-
-def _adjusted_poses(run: FlightRun, adjustment: Adjustment) -> CameraPoses:
+def _adjusted_poses(run: FlightRun, part: FlightPart) -> CameraPoses:
     """Poses after the adjustment, in the run's frame."""
-    mine = _images_of(run, adjustment)
+    adjustment, mine = part.adjustment, part.images
     n = len(adjustment.block)
     blocks = adjustment.camera_covariance[: 6 * n, : 6 * n].reshape(n, 6, n, 6)
     covariance: FloatArray = np.stack([blocks[k, :, k] for k in mine])
@@ -430,12 +450,12 @@ def _describe_source(run: FlightRun, file: Path) -> JSONObject:
     }
 
 
-def _describe_result(run: FlightRun, adjustment: Adjustment, chosen: IntArray, points: FlightPoints) -> JSONObject:
-    matching, block = run.matching, run.block
+def _describe_result(run: FlightRun, part: FlightPart, points: FlightPoints) -> JSONObject:
+    matching, block, adjustment = run.matching, run.block, part.adjustment
     residual = adjustment.residuals
-    of_flight = np.isin(adjustment.observations.point, chosen)
+    of_flight = np.isin(adjustment.observations.point, part.points)
     size = np.sqrt(np.sum(residual[of_flight] ** 2, axis=1))
-    correction = adjustment.pose_correction[_images_of(run, adjustment)]
+    correction = adjustment.pose_correction[part.images]
     cell = 2.0
     west, _, south, _ = points.cloud.region
     columns, rows = (points.cloud.easting - west) // cell, (points.cloud.northing - south) // cell

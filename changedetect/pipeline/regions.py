@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from changedetect.typing import Region
 
-__all__ = ["describe_region", "join_regions", "regions_overlap"]
+__all__ = ["common_ground", "describe_region", "join_regions", "regions_overlap"]
 
 
 def join_regions(one: Region | None, other: Region) -> Region:
@@ -19,6 +19,20 @@ def join_regions(one: Region | None, other: Region) -> Region:
     if one is None:
         return other
     return min(one[0], other[0]), max(one[1], other[1]), min(one[2], other[2]), max(one[3], other[3])
+
+
+def common_ground(one: Region, other: Region) -> Region | None:
+    """
+    Ground that two regions both hold; None where they do not overlap or only touch.
+
+    Examples
+    --------
+    >>> common_ground((0.0, 2.0, 0.0, 2.0), (1.0, 3.0, -1.0, 1.0))
+    (1.0, 2.0, 0.0, 1.0)
+    """
+    west, east = max(one[0], other[0]), min(one[1], other[1])
+    south, north = max(one[2], other[2]), min(one[3], other[3])
+    return (west, east, south, north) if west < east and south < north else None
 
 
 def regions_overlap(one: Region, other: Region) -> bool:

@@ -7,6 +7,7 @@ import math
 import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,15 +15,15 @@ import numpy as np
 from scipy import stats
 
 from changedetect.catalogue import plan
-from changedetect.errors import InputDataError, OutputError
+from changedetect.errors import InputDataError, ModelStateError, OutputError
 from changedetect.io.netcdf import Layer
 from changedetect.io.series import SERIES_CLASSES, SeriesMetadata, ZoneSeries, write_series, write_table
 from changedetect.io.zones import covered_cells, read_zones
 from changedetect.pipeline.learn import ModelShelf
 from changedetect.pipeline.manifest import new_run_id, utc_now
-from changedetect.pipeline.queries import require_absent
+from changedetect.pipeline.queries import require_absent, require_suffix
 from changedetect.pipeline.rasters import product_grid
-from changedetect.pipeline.regions import join_regions
+from changedetect.pipeline.regions import describe_region, join_regions
 from changedetect.pipeline.stacking import add_errors, stack_epochs
 from changedetect.timeseries.judgement import (
     ChangePrior,
@@ -126,12 +127,14 @@ def make_series(
 
     Raises
     ------
+    UsageError
+        The output does not end in ``.nc``.
     InputDataError
-        The output does not end in ``.nc``; fewer than two epochs have been learned; the zones cannot be used.
+        Fewer than two epochs have been learned; the bounds lie in a gap of the data; the zones cannot be used.
     MissingInputError, CRSMismatchError
         The zones cannot be read.
     ConfigError
-        Resolution or bounds enclose nothing.
+        Resolution or bounds enclose nothing, or the bounds no data.
     OutputExistsError, OutputError
         An output exists, or cannot be written.
     """
@@ -147,19 +150,24 @@ def make_series(
         "monitoring": monitoring,
         "files": {name: str(path) for name, path in files.items()},
     }
+    grid = _common_grid(programme, epochs, resolution, bounds)
+    areas, names, told = _areas(listed, grid)
+    warnings += told
     if dry_run:
         return details | {"warnings": warnings}
     models = ModelShelf(programme, capacity=1)
-    grid = _common_grid(programme, epochs, models, resolution, bounds)
     with _scratch(output) as scratch:
         ids = [epoch.epoch_id for epoch in epochs]
         stack = stack_epochs(models.get, ids, grid, scratch)
+        if not stack.observed.any():
+            msg = (
+                f"No epoch observed anything in {describe_region(grid.region)}, a gap in all data. Choose other bounds."
+            )
+            raise InputDataError(msg)
         rate = 1.0 - programme.config.differencing.confidence
         level = monitoring_level(len(epochs), rate) if monitoring else rate
         problem = _Problem(programme, epochs, grid, stack, *add_errors(programme, ids, stack, grid), level)
         prior, cells = _judge_cells(problem)
-        areas, names, told = _areas(listed, grid)
-        warnings += told
         found = _judge_areas(problem, areas, prior)
         tables = _tables(problem, names, areas, found) if listed else None
         zone_series = ZoneSeries(names[1:], tables.over_time, found.judged(1)) if tables is not None else None
@@ -179,9 +187,7 @@ def make_series(
 
 
 def _files(output: Path, *, with_zones: bool) -> dict[str, Path]:
-    if output.suffix.lower() != ".nc":
-        msg = f"'{output}' does not end in .nc; a series is written as NetCDF."
-        raise InputDataError(msg)
+    require_suffix(output, (".nc",), "A series is written as NetCDF, tables of zones beside it.")
     tables = {name: output.with_name(f"{output.stem}_{name}.csv") for name in ("zones", "budgets")}
     return {"series": output} | (tables if with_zones else {})
 
@@ -213,14 +219,20 @@ def _learned_epochs(programme: Programme) -> tuple[tuple[Epoch, ...], list[str]]
 def _common_grid(
     programme: Programme,
     epochs: Sequence[Epoch],
-    models: ModelShelf,
     resolution: float | None,
     bounds: Region | None,
 ) -> Grid:
-    region = models.get(epochs[0].epoch_id).region
-    for epoch in epochs[1:]:
-        region = join_regions(region, models.get(epoch.epoch_id).region)
-    return product_grid(programme.config, region, resolution=resolution, bounds=bounds)
+    regions = []
+    for epoch in epochs:
+        found = programme.state_record(epoch.epoch_id)
+        if found is None:
+            msg = (
+                f"'{programme.state_directory(epoch.epoch_id)}' has no manifest. Learn the epoch again: changedetect "
+                f"update {programme.directory}"
+            )
+            raise ModelStateError(msg)
+        regions.append(found[0].region)
+    return product_grid(programme.config, reduce(join_regions, regions), resolution=resolution, bounds=bounds)
 
 
 @contextmanager

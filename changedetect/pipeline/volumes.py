@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from changedetect.differencing import AreaBudget, area_budget, elevation_bands
-from changedetect.errors import InputDataError
+from changedetect.errors import UsageError
 from changedetect.io.geopackage import write_zone_budgets
 from changedetect.io.zones import covered_cells, read_zones
 from changedetect.pipeline.learn import ModelShelf
 from changedetect.pipeline.pairs import difference_pair
 from changedetect.pipeline.products import offset_warning
-from changedetect.pipeline.queries import require_absent
+from changedetect.pipeline.queries import require_absent, require_suffix
 from changedetect.storage import atomic_path
 
 if TYPE_CHECKING:
@@ -71,15 +71,18 @@ def measure_volumes(
 
     Raises
     ------
+    UsageError
+        The output ends neither in ``.csv`` nor in ``.gpkg``, or is to hold zones and none are named.
     MissingInputError, InputDataError, CRSMismatchError
         The zones cannot be used.
     OutputExistsError
         The output exists.
     """
     if output is not None:
+        require_suffix(output, (".csv", ".gpkg"), "CSV holds a table of all budgets, GeoPackage the zones with theirs.")
         if output.suffix.lower() == ".gpkg" and zones is None:
-            msg = f"'{output}' is to hold zones with their budgets, but no zones are named; add them, or write a .csv."
-            raise InputDataError(msg)
+            msg = f"'{output}' is to hold zones with their budgets: name them with --zones, or write a .csv."
+            raise UsageError(msg)
         require_absent(output, overwrite=overwrite)
     config = programme.config
     programme.pair(earlier, later)

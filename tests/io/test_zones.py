@@ -3,9 +3,9 @@
 import json
 
 import numpy as np
-import pyogrio
 import pytest
 import shapely
+from small_surveys import write_zones
 
 from changedetect.errors import CRSMismatchError, InputDataError, MissingInputError
 from changedetect.grid import Grid
@@ -15,26 +15,10 @@ CRS = "EPSG:32632+5773"
 SQUARE = shapely.box(500_010.0, 5_300_010.0, 500_030.0, 5_300_020.0)
 
 
-def write(path, geometries, names=None, crs="EPSG:32632", layer="zones", append=False, column="name"):
-    names = names if names is not None else [f"zone {k}" for k in range(len(geometries))]
-    pyogrio.raw.write(
-        path,
-        np.array([None if g is None else shapely.to_wkb(g) for g in geometries], object),
-        [np.array(names, object)],
-        [column],
-        layer=layer,
-        driver="GPKG",
-        geometry_type="Unknown",
-        crs=crs,
-        append=append,
-    )
-    return path
-
-
 def test_polygons_come_with_their_names(tmp_path):
     hole = shapely.Polygon(SQUARE.exterior, [shapely.box(500_012, 5_300_012, 500_014, 5_300_014).exterior.coords])
     both = shapely.MultiPolygon([SQUARE, shapely.transform(SQUARE, lambda v: v + np.array([100.0, 0.0]))])
-    zones = read_zones(write(tmp_path / "z.gpkg", [hole, both], ["beach", "dune"]), CRS)
+    zones = read_zones(write_zones(tmp_path / "z.gpkg", [hole, both], ["beach", "dune"]), CRS)
     assert [zone.name for zone in zones] == ["beach", "dune"]
     np.testing.assert_allclose(zones[0].polygon.area, 196.0, rtol=1e-9, atol=0.0)
 
@@ -44,7 +28,7 @@ def test_zones_in_another_crs_land_where_they_belong(tmp_path):
 
     back = Transformer.from_crs(32632, 25833, always_xy=True)
     moved = shapely.transform(SQUARE, lambda v: np.column_stack(back.transform(v[:, 0], v[:, 1])))
-    zone = read_zones(write(tmp_path / "z.gpkg", [moved], crs="EPSG:25833"), CRS)[0]
+    zone = read_zones(write_zones(tmp_path / "z.gpkg", [moved], crs="EPSG:25833"), CRS)[0]
     np.testing.assert_allclose(zone.polygon.bounds, SQUARE.bounds, rtol=0.0, atol=1.0)
 
 
@@ -61,12 +45,12 @@ def test_geojson_is_longitude_and_latitude(tmp_path):
 
 
 def test_names_that_are_missing_or_occur_twice_get_numbers(tmp_path):
-    zones = read_zones(write(tmp_path / "z.gpkg", [SQUARE] * 4, ["a", "b", "b", ""]), CRS)
+    zones = read_zones(write_zones(tmp_path / "z.gpkg", [SQUARE] * 4, ["a", "b", "b", ""]), CRS)
     assert [zone.name for zone in zones] == ["a", "b 2", "b 3", "4"]
 
 
 def test_a_column_of_names_can_be_chosen(tmp_path):
-    path = write(tmp_path / "z.gpkg", [SQUARE], ["cell 9"], column="compartment")
+    path = write_zones(tmp_path / "z.gpkg", [SQUARE], ["cell 9"], column="compartment")
     assert read_zones(path, CRS)[0].name == "1"
     assert read_zones(path, CRS, name_column="compartment")[0].name == "cell 9"
     with pytest.raises(InputDataError, match="no column 'nam'; it has compartment"):
@@ -86,7 +70,7 @@ BOWTIE = shapely.Polygon([(0, 0), (1, 1), (1, 0), (0, 1)])
     ],
 )
 def test_a_feature_that_is_no_area_is_named(tmp_path, geometry, message):
-    path = write(tmp_path / "z.gpkg", [SQUARE, geometry])
+    path = write_zones(tmp_path / "z.gpkg", [SQUARE, geometry])
     with pytest.raises(InputDataError, match=message):
         read_zones(path, CRS)
 
@@ -99,14 +83,14 @@ def test_files_that_cannot_be_used_say_why(tmp_path):
     with pytest.raises(InputDataError, match="cannot be read as a vector file"):
         read_zones(tmp_path / "text.gpkg", CRS)
     with pytest.raises(InputDataError, match="holds no features"):
-        read_zones(write(tmp_path / "empty.gpkg", []), CRS)
+        read_zones(write_zones(tmp_path / "empty.gpkg", []), CRS)
     with pytest.raises(CRSMismatchError, match="states no coordinate reference system"):
-        read_zones(write(tmp_path / "nowhere.gpkg", [SQUARE], crs=None), CRS)
+        read_zones(write_zones(tmp_path / "nowhere.gpkg", [SQUARE], crs=None), CRS)
 
 
 def test_of_several_layers_one_must_be_named(tmp_path):
-    path = write(tmp_path / "z.gpkg", [SQUARE], layer="one")
-    write(path, [SQUARE, SQUARE], layer="two", append=True)
+    path = write_zones(tmp_path / "z.gpkg", [SQUARE], layer="one")
+    write_zones(path, [SQUARE, SQUARE], layer="two", append=True)
     with pytest.raises(InputDataError, match=r"2 layers \(one, two\)"):
         read_zones(path, CRS)
     assert len(read_zones(path, CRS, layer="two")) == 2
@@ -127,3 +111,28 @@ def test_cells_count_where_their_centres_lie_in_the_polygon():
 def test_a_polygon_beside_the_grid_covers_nothing():
     grid = Grid.from_region((500_000.0, 500_050.0, 5_300_000.0, 5_300_040.0), 2.0, CRS)
     assert covered_cells(shapely.box(600_000.0, 0.0, 600_001.0, 1.0), grid) is None
+
+
+def test_what_cannot_be_reached_from_the_zones_crs_is_said_of_the_file_without_options_of_other_commands(tmp_path):
+    path = write_zones(tmp_path / "z.gpkg", [SQUARE], crs="IAU_2015:30100", layer="moon")
+    with pytest.raises(CRSMismatchError, match=r"z\.gpkg', layer 'moon': .*Save Features As") as caught:
+        read_zones(path, CRS)
+    assert "--crs" not in str(caught.value)
+
+
+def test_metres_in_a_geojson_are_told_with_the_feature(tmp_path):
+    feature = {"type": "Feature", "properties": {"name": "slip"}, "geometry": json.loads(shapely.to_geojson(SQUARE))}
+    (tmp_path / "z.geojson").write_text(json.dumps(feature))
+    with pytest.raises(CRSMismatchError, match=r"feature 1 \('slip'\).*GeoJSON is in longitude and latitude") as caught:
+        read_zones(tmp_path / "z.geojson", CRS)
+    assert "--crs" not in str(caught.value)
+
+
+@pytest.mark.filterwarnings("ignore:Non closed ring")
+def test_a_ring_that_does_not_close_is_named(tmp_path):
+    ring = [[9.0, 48.0], [9.1, 48.0], [9.1, 48.1]]
+    geometry = {"type": "Polygon", "coordinates": [ring]}
+    feature = {"type": "Feature", "properties": {"name": "slip"}, "geometry": geometry}
+    (tmp_path / "z.geojson").write_text(json.dumps(feature))
+    with pytest.raises(InputDataError, match=r"feature 1 \('slip'\).*Fix geometries"):
+        read_zones(tmp_path / "z.geojson", CRS)
