@@ -149,7 +149,7 @@ def test_a_folder_that_does_not_exist_ends_with_its_exit_code(tmp_path):
 
 
 def test_outputs_of_an_unknown_kind_and_flights_of_one_name_are_refused(tmp_path):
-    with pytest.raises(UsageError, match=r"points\.csv' ends in none of \.laz, \.las"):
+    with pytest.raises(UsageError, match=r"points\.csv' does not end in \.laz or \.las"):
         reconstruct([tmp_path], tmp_path / "points.csv", ReconstructOptions())
     with pytest.raises(UsageError, match=r"points\.laz' looks like a file\. 2 flights"):
         reconstruct([tmp_path / "a", tmp_path / "b"], tmp_path / "points.laz", ReconstructOptions())

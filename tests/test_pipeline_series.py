@@ -183,7 +183,7 @@ def test_a_dry_run_checks_everything_and_writes_nothing(site, zones, tmp_path, c
 
 def test_what_cannot_be_meant_is_refused(site, zones, tmp_path, capsys):
     done = run(capsys, "series", site, "-o", tmp_path / "s.tif", expect=2)
-    assert "s.tif' ends in none of .nc" in done["error"]["message"]
+    assert "s.tif' does not end in .nc." in done["error"]["message"]
     run(capsys, "series", site, "-o", tmp_path / "s.nc", "--zones", tmp_path / "none.gpkg", expect=66)
     run(capsys, "series", tmp_path / "nowhere", "-o", tmp_path / "s.nc", expect=66)
     (tmp_path / "s.nc").write_text("kept")
@@ -210,9 +210,9 @@ def test_bounds_away_from_the_data_are_refused(site, tmp_path, capsys):
 
 
 def test_bounds_in_a_gap_of_all_data_are_refused(tmp_path, capsys):
-    programme = make_programme(
-        tmp_path / "site", {DATES[0]: {}, DATES[1]: {"shift": 60.0}}, coregistration={"enabled": False}
-    )
+    programme = make_programme(tmp_path / "site", {DATES[0]: {}, DATES[1]: {"shift": 60.0}})
+    with (programme.directory / "programme.toml").open("a") as stream:
+        stream.write("\n[coregistration]\nenabled = false\n")
     run(capsys, "update", programme.directory)
     gap = (WEST + 35, WEST + 45, SOUTH, SOUTH + SIDE)
     done = run(capsys, "series", programme.directory, "-o", tmp_path / "s.nc", "--bounds", *gap, expect=65)

@@ -75,15 +75,18 @@ def test_a_dry_run_checks_the_zones_and_writes_nothing(site, zones, capsys, tmp_
     before = snapshot(tmp_path)
     done = run(capsys, "volume", site, FIRST, SECOND, "--zones", zones, "-o", tmp_path / "v.csv", "--dry-run")
     assert done["n_zones"] == 3
+    assert done["warnings"] == ["zone 'elsewhere' lies outside the ground of both epochs"]
     assert snapshot(tmp_path) == before
     run(capsys, "volume", site, FIRST, SECOND, "--zones", tmp_path / "none.gpkg", "--dry-run", expect=66)
 
 
 def test_what_cannot_be_meant_is_refused(site, capsys, tmp_path):
     run(capsys, "volume", site, FIRST, SECOND, "--bands", 0, expect=2)
+    done = run(capsys, "volume", site, FIRST, SECOND, "--layer", "one", expect=2)
+    assert "name it with --zones" in done["error"]["message"]
     run(capsys, "volume", site, FIRST, "2030-01-01", expect=66)
     done = run(capsys, "volume", site, FIRST, SECOND, "-o", tmp_path / "v.txt", expect=2)
-    assert "v.txt' ends in none of .csv, .gpkg" in done["error"]["message"]
+    assert "v.txt' does not end in .csv or .gpkg." in done["error"]["message"]
     done = run(capsys, "volume", site, FIRST, SECOND, "-o", tmp_path / "v.gpkg", expect=2)
     assert "--zones" in done["error"]["message"]
     (tmp_path / "v.csv").write_text("kept")

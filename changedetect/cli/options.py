@@ -23,6 +23,7 @@ __all__ = [
     "parse_classes",
     "parse_columns",
     "parse_sigma",
+    "require_zones",
 ]
 
 
@@ -92,3 +93,17 @@ def parse_sigma(sigma: float | None) -> float | None:
         msg = f"a standard deviation is above zero, in metres, such as 0.05; got {sigma:g}"
         raise typer.BadParameter(msg, param_hint="--sigma")
     return sigma
+
+
+def require_zones(zones: Path | None, layer: str | None, name_column: str | None) -> None:
+    """
+    Refuse options about zones where none are given.
+
+    Raises
+    ------
+    typer.BadParameter
+    """
+    given = [name for name, value in (("--layer", layer), ("--name-column", name_column)) if value is not None]
+    if zones is None and given:
+        msg = "is about the zones of a file; name it with --zones"
+        raise typer.BadParameter(msg, param_hint=given[0])

@@ -18,6 +18,7 @@ from changedetect.cli.options import (
     Resolution,
     ZoneLayer,
     ZoneNames,
+    require_zones,
 )
 from changedetect.cli.session import Outcome, Session, command
 
@@ -198,6 +199,7 @@ def volume(
     if bands is not None and not bands > 0.0:
         msg = f"the height of a band must be above zero, not {bands:g}"
         raise typer.BadParameter(msg, param_hint="--bands")
+    require_zones(zones, layer, name_column)
     programme = _asked(_asked(session.open(directory), earlier), later)
     details = measure_volumes(
         programme,
@@ -212,10 +214,10 @@ def volume(
         dry_run=dry_run,
     )
     document = {"directory": str(directory), "earlier": earlier, "later": later, "dry_run": dry_run, **details}
-    if dry_run:
-        return Outcome(document, [f"Would measure the volumes from {earlier} to {later}, {details['n_zones']} zones"])
     for warning in details["warnings"]:
         logger.warning("%s", warning)
+    if dry_run:
+        return Outcome(document, [f"Would measure the volumes from {earlier} to {later}, {details['n_zones']} zones"])
     return Outcome(document, [_volume_table(details), *(f"Warning: {text}" for text in details["warnings"])])
 
 

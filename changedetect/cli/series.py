@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from changedetect.cli.options import Bounds, Directory, DryRun, Overwrite, Resolution, ZoneLayer, ZoneNames
+from changedetect.cli.options import (
+    Bounds,
+    Directory,
+    DryRun,
+    Overwrite,
+    Resolution,
+    ZoneLayer,
+    ZoneNames,
+    require_zones,
+)
 from changedetect.cli.session import Outcome, Session, command
 
 if TYPE_CHECKING:
@@ -67,6 +76,7 @@ def series(
     """
     from changedetect.pipeline.series import make_series
 
+    require_zones(zones, layer, name_column)
     details = make_series(
         session.open(directory),
         output,

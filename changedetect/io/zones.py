@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -25,6 +26,7 @@ __all__ = ["Zone", "covered_cells", "read_zones"]
 #: Columns a zone's name is taken from, the first that exists; upper and lower case are the same.
 _NAME_COLUMNS = ("name", "zone", "label", "title", "id", "location")
 AnyPolygon: TypeAlias = shapely.Polygon | shapely.MultiPolygon
+_KINDS = "Name a GeoPackage, GeoJSON or shapefile with polygons."
 _FIX = "Open the file in QGIS, run 'Fix geometries' or delete the feature, and save it again."
 
 
@@ -87,7 +89,7 @@ def read_zones(path: Path, crs: str, *, layer: str | None = None, name_column: s
     """
     path = Path(path)
     if not path.exists():
-        msg = f"'{path}' does not exist. Name a GeoPackage, GeoJSON or shapefile with polygons."
+        msg = f"'{path}' does not exist. {_KINDS}"
         raise MissingInputError(msg)
     layer = _only_layer(path, layer)
     meta, geometries, columns = _read(path, layer)
@@ -167,7 +169,7 @@ def _only_layer(path: Path, layer: str | None) -> str | None:
     try:
         available = [str(name) for name, kind in pyogrio.list_layers(path) if kind is not None]
     except DataSourceError as error:
-        msg = f"'{path}' cannot be read as a vector file: {error}"
+        msg = f"'{path}' cannot be read as a vector file: {str(error).split(';')[0].rstrip('.')}. {_KINDS}"
         raise InputDataError(msg) from error
     if layer is None and len(available) > 1:
         msg = (
@@ -186,7 +188,7 @@ def _read(path: Path, layer: str | None) -> tuple[dict[str, Any], Any, list[Any]
     try:
         meta, _, geometries, columns = pyogrio.raw.read(path, layer=layer)
     except (DataSourceError, DataLayerError) as error:
-        msg = f"'{path}' cannot be read as a vector file: {error}"
+        msg = f"'{path}' cannot be read as a vector file: {str(error).split(';')[0].rstrip('.')}. {_KINDS}"
         raise InputDataError(msg) from error
     if geometries is None:
         msg = f"'{path}' holds a table without geometries; polygons are expected."
@@ -204,7 +206,16 @@ def _names(where: str, fields: list[str], columns: list[Any], n: int, name_colum
     if found is None:
         return [str(k) for k in range(1, n + 1)]
     names = ["" if v is None else str(v).strip() for v in columns[fields.index(found)]]
-    return [name if name and names.count(name) == 1 else f"{name} {k}".strip() for k, name in enumerate(names, start=1)]
+    taken = {name for name in names if name and names.count(name) == 1}
+    unique = []
+    for number, name in enumerate(names, start=1):
+        if name and names.count(name) == 1:
+            unique.append(name)
+            continue
+        candidates = (f"{name} {k}".strip() for k in itertools.count(number, n))
+        unique.append(next(candidate for candidate in candidates if candidate not in taken))
+        taken.add(unique[-1])
+    return unique
 
 
 def _checked(what: str, binary: bytes | None) -> AnyPolygon:
@@ -217,7 +228,7 @@ def _checked(what: str, binary: bytes | None) -> AnyPolygon:
         msg = f"{what} has no geometry. {_FIX}"
         raise InputDataError(msg)
     if not isinstance(geometry, shapely.Polygon | shapely.MultiPolygon):
-        msg = f"{what} is a {geometry.geom_type}; zones are polygons. {_FIX}"
+        msg = f"{what} is a {geometry.geom_type}; zones are polygons. Delete it, or buffer it in QGIS to a polygon."
         raise InputDataError(msg)
     if not geometry.is_valid:
         reason = shapely.is_valid_reason(geometry)

@@ -103,10 +103,13 @@ def align_epoch(
     except AlignmentError as error:
         if bound is not None:
             return _as_bound(programme, cloud, record, bound, None)
+        named = f" (Stable areas: '{areas}'.)" if areas is not None and error.cause == "stable ground" else ""
         if kind != "auto" or error.cause == "units":
-            msg = f"Epoch {epoch.epoch_id} cannot be aligned to epoch {reference_id}: {error}"
+            msg = f"Epoch {epoch.epoch_id} cannot be aligned to epoch {reference_id}: {error}{named}"
             raise AlignmentError(msg, error.cause) from error
-        warning = f"Not aligned, for want of {error.cause}: {error} Differences hold the offset of this epoch, if any."
+        warning = (
+            f"Not aligned, for want of {error.cause}: {error} Differences hold the offset of this epoch, if any.{named}"
+        )
         return cloud, replace(record, wording=warning, warnings=(warning,))
     if bound is not None:
         return _as_bound(programme, cloud, record, bound, alignment)

@@ -15,7 +15,7 @@ from changedetect.errors import ConfigError, InputDataError, MissingInputError, 
 from changedetect.pipeline.flight_inputs import is_flight_folder
 from changedetect.pipeline.lock import programme_lock
 from changedetect.pipeline.reading import read_epoch_points
-from changedetect.pipeline.regions import describe_region, regions_overlap
+from changedetect.pipeline.regions import describe_region, regions_overlap, unit_hint
 from changedetect.storage import atomic_path, sha256_of_file
 from changedetect.typing import Region
 
@@ -258,10 +258,11 @@ def _require_overlap(programme: Programme, epoch_id: str, region: Region) -> Non
     if not known or any(regions_overlap(region, other) for other in known.values()):
         return
     name, other = list(known.items())[-1]
+    hint = next(filter(None, (unit_hint(region, each) for each in known.values())), "")
     msg = (
         f"The sources do not overlap the programme: they span {describe_region(region)} in {programme.config.crs}, "
-        f"epoch '{name}' spans {describe_region(other)}. Check the CRS of the files (--crs) and whether they are of "
-        "this site."
+        f"epoch '{name}' spans {describe_region(other)}. {hint}Check the CRS of the files (--crs) and "
+        "whether they are of this site."
     )
     raise InputDataError(msg)
 

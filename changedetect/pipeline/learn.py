@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import reduce
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -26,9 +28,11 @@ from changedetect.models.registry import create_model, load_model
 from changedetect.pipeline.alignment import align_epoch
 from changedetect.pipeline.manifest import utc_now
 from changedetect.pipeline.reading import read_epoch_points
+from changedetect.pipeline.regions import join_regions
 from changedetect.storage import atomic_directory
+from changedetect.typing import Region
 
-__all__ = ["Model", "ModelShelf", "learn_epoch"]
+__all__ = ["Model", "ModelShelf", "learn_epoch", "learned_region"]
 
 logger = logging.getLogger(__name__)
 
@@ -205,3 +209,25 @@ def _write_state(programme: Programme, epoch: Epoch, parent: Epoch | None, learn
             software_version=changedetect.__version__,
             created=utc_now(),
         ).write(temporary)
+
+
+def learned_region(programme: Programme, epoch_ids: Sequence[str]) -> Region:
+    """
+    Ground that the models of epochs hold together, as their manifests say.
+
+    Raises
+    ------
+    ModelStateError
+        A model has no manifest.
+    """
+    regions = []
+    for epoch_id in epoch_ids:
+        found = programme.state_record(epoch_id)
+        if found is None:
+            msg = (
+                f"'{programme.state_directory(epoch_id)}' has no manifest. Learn the epoch again: changedetect update "
+                f"{programme.directory}"
+            )
+            raise ModelStateError(msg)
+        regions.append(found[0].region)
+    return reduce(join_regions, regions)

@@ -94,7 +94,8 @@ def difference_pair(programme: Programme, earlier: str, later: str, models: Mode
         stable = stable_cells(programme, grid)
         maps = difference_models(first, second, grid, config.differencing, stable=stable, coherent=terms)
     except TooLittleGroundError as error:
-        logger.warning("%s to %s: %s; unchanged ground is found instead", earlier, later, error)
+        areas = programme.stable_areas_path
+        logger.warning("%s to %s: %s ('%s'); unchanged ground is found instead", earlier, later, error, areas)
         maps = difference_models(first, second, grid, config.differencing, coherent=terms)
     confidence = config.differencing.confidence
     objects = find_objects_of_change(maps, grid.resolution, confidence, 1.0 - confidence)

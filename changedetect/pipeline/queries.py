@@ -240,7 +240,7 @@ def require_suffix(output: Path, suffixes: Sequence[str], content: str) -> None:
     """
     suffix = output.suffix.lower()
     if suffixes and suffix not in suffixes:
-        msg = f"'{output}' ends in none of {', '.join(suffixes)}. {content}"
+        msg = f"'{output}' does not end in {' or '.join(suffixes)}. {content}"
         raise UsageError(msg)
     if not suffixes and suffix in _FILE_SUFFIXES:
         msg = f"'{output}' looks like a file. {content} Name a folder."

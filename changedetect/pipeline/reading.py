@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from changedetect.catalogue import POINTS_FOLDER, Epoch, Programme, Source, SourceRecord
 from changedetect.errors import InputDataError, ModelStateError
 from changedetect.io.points import SourceOptions, iter_programme_chunks, open_points
-from changedetect.pipeline.regions import describe_region, join_regions
+from changedetect.pipeline.regions import describe_region, join_regions, unit_hint
 from changedetect.pointcloud import PointCloud, check_count
 from changedetect.storage import sha256_of_file
 from changedetect.typing import Region
@@ -91,7 +91,8 @@ def read_source(programme: Programme, source: Source) -> tuple[PointCloud, Sourc
     if len(cloud) == 0 and extent is not None and programme.config.bounds is not None:
         msg = (
             f"'{path}' lies outside the programme: its points span {describe_region(extent)} in "
-            f"{programme.config.crs}, the bounds are {describe_region(programme.config.bounds)}. Check the CRS of the "
+            f"{programme.config.crs}, the bounds are {describe_region(programme.config.bounds)}. "
+            f"{unit_hint(extent, programme.config.bounds)}Check the CRS of the "
             "file (--crs), or the bounds in programme.toml."
         )
         raise InputDataError(msg)

@@ -7,7 +7,6 @@ import math
 import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,15 +14,15 @@ import numpy as np
 from scipy import stats
 
 from changedetect.catalogue import plan
-from changedetect.errors import InputDataError, ModelStateError, OutputError
+from changedetect.errors import InputDataError, OutputError
 from changedetect.io.netcdf import Layer
 from changedetect.io.series import SERIES_CLASSES, SeriesMetadata, ZoneSeries, write_series, write_table
 from changedetect.io.zones import covered_cells, read_zones
-from changedetect.pipeline.learn import ModelShelf
+from changedetect.pipeline.learn import ModelShelf, learned_region
 from changedetect.pipeline.manifest import new_run_id, utc_now
 from changedetect.pipeline.queries import require_absent, require_suffix
 from changedetect.pipeline.rasters import product_grid
-from changedetect.pipeline.regions import describe_region, join_regions
+from changedetect.pipeline.regions import describe_region
 from changedetect.pipeline.stacking import add_errors, stack_epochs
 from changedetect.timeseries.judgement import (
     ChangePrior,
@@ -150,14 +149,14 @@ def make_series(
         "monitoring": monitoring,
         "files": {name: str(path) for name, path in files.items()},
     }
-    grid = _common_grid(programme, epochs, resolution, bounds)
+    ids = [epoch.epoch_id for epoch in epochs]
+    grid = product_grid(programme.config, learned_region(programme, ids), resolution=resolution, bounds=bounds)
     areas, names, told = _areas(listed, grid)
     warnings += told
     if dry_run:
         return details | {"warnings": warnings}
     models = ModelShelf(programme, capacity=1)
     with _scratch(output) as scratch:
-        ids = [epoch.epoch_id for epoch in epochs]
         stack = stack_epochs(models.get, ids, grid, scratch)
         if not stack.observed.any():
             msg = (
@@ -214,25 +213,6 @@ def _learned_epochs(programme: Programme) -> tuple[tuple[Epoch, ...], list[str]]
         )
         raise InputDataError(msg)
     return tuple(learned), warnings
-
-
-def _common_grid(
-    programme: Programme,
-    epochs: Sequence[Epoch],
-    resolution: float | None,
-    bounds: Region | None,
-) -> Grid:
-    regions = []
-    for epoch in epochs:
-        found = programme.state_record(epoch.epoch_id)
-        if found is None:
-            msg = (
-                f"'{programme.state_directory(epoch.epoch_id)}' has no manifest. Learn the epoch again: changedetect "
-                f"update {programme.directory}"
-            )
-            raise ModelStateError(msg)
-        regions.append(found[0].region)
-    return product_grid(programme.config, reduce(join_regions, regions), resolution=resolution, bounds=bounds)
 
 
 @contextmanager

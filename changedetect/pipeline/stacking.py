@@ -181,7 +181,7 @@ def add_errors(
     try:
         models = epoch_errors(stack, stable)
     except TooLittleGroundError as error:
-        logger.warning("%s; unchanged ground is found instead", error)
+        logger.warning("%s ('%s'); unchanged ground is found instead", error, programme.stable_areas_path)
         models = epoch_errors(stack, None)
     seen = np.any(stack.observed, axis=0)
     elevation: FloatArray = np.where(seen, stack.terrain[0], np.nan)

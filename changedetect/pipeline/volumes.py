@@ -12,10 +12,11 @@ from changedetect.differencing import AreaBudget, area_budget, elevation_bands
 from changedetect.errors import UsageError
 from changedetect.io.geopackage import write_zone_budgets
 from changedetect.io.zones import covered_cells, read_zones
-from changedetect.pipeline.learn import ModelShelf
+from changedetect.pipeline.learn import ModelShelf, learned_region
 from changedetect.pipeline.pairs import difference_pair
 from changedetect.pipeline.products import offset_warning
 from changedetect.pipeline.queries import require_absent, require_suffix
+from changedetect.pipeline.rasters import product_grid
 from changedetect.storage import atomic_path
 
 if TYPE_CHECKING:
@@ -88,7 +89,10 @@ def measure_volumes(
     programme.pair(earlier, later)
     listed = () if zones is None else read_zones(zones, config.crs, layer=layer, name_column=name_column)
     if dry_run:
-        return {"n_zones": len(listed)}
+        grid = product_grid(config, learned_region(programme, (earlier, later)))
+        away = [zone.name for zone in listed if covered_cells(zone.polygon, grid) is None]
+        warnings = [f"zone '{name}' lies outside the ground of both epochs" for name in away]
+        return {"n_zones": len(listed), "warnings": warnings}
     difference = difference_pair(programme, earlier, later, ModelShelf(programme))
     grid, maps, direction = difference.grid, difference.maps, difference.objects.direction
     confidence = config.differencing.confidence

@@ -47,6 +47,8 @@ def test_geojson_is_longitude_and_latitude(tmp_path):
 def test_names_that_are_missing_or_occur_twice_get_numbers(tmp_path):
     zones = read_zones(write_zones(tmp_path / "z.gpkg", [SQUARE] * 4, ["a", "b", "b", ""]), CRS)
     assert [zone.name for zone in zones] == ["a", "b 2", "b 3", "4"]
+    again = read_zones(write_zones(tmp_path / "again.gpkg", [SQUARE] * 4, ["a", "a", "a 2", "1"]), CRS)
+    assert [zone.name for zone in again] == ["a 1", "a 6", "a 2", "1"]
 
 
 def test_a_column_of_names_can_be_chosen(tmp_path):
