@@ -134,6 +134,10 @@ def missing_photo(flight):
     (flight / "images" / "e1_0002.jpg").unlink()
 
 
+def copied_photo(flight):
+    shutil.copy(flight / "images" / "e1_0001.jpg", flight / "images" / "e1_0004.jpg")
+
+
 def another_camera(flight):
     path = flight / "images" / "e1_0001.jpg"
     cv2.imwrite(str(path), np.zeros((100, 120), np.uint8))
@@ -147,6 +151,11 @@ def wrong_axes(flight):
     log = Log(flight / "imu.csv")
     log.rows[:, [2, 3, 5, 6]] *= -1
     log.write()
+
+
+def imu_without_rows(flight):
+    path = flight / "imu.csv"
+    path.write_text(path.read_text().splitlines()[0] + "\n")
 
 
 def no_gps(flight):
@@ -168,8 +177,10 @@ BAD = [
     (camera_seconds_early, 65, r"images.csv", r"off by \+(4\.9|5\.)\d"),
     (sea_level, 65, r"gps.csv", r"rename it alt_msl_m"),
     (missing_photo, 66, r"images.csv", r"e1_0002.jpg. Put them there, or remove their lines"),
+    (copied_photo, 65, r"e1_0004.jpg", r"is a copy of e1_0001.jpg. Put the right picture there"),
     (another_camera, 65, r"e1_0001.jpg", r"Use the camera file of these photos"),
     (no_photos_listed, 65, r"images.csv", r"lists no photos"),
+    (imu_without_rows, 65, r"imu.csv", r"has 0 inertial samples; at least 10 are needed"),
     (no_gps, 66, r"gps.csv", r"A flight folder holds imu.csv, gps.csv"),
 ]
 
@@ -191,6 +202,18 @@ def test_a_spoilt_flight_is_refused_with_file_and_fix_and_nothing_is_written(
         assert re.search(fix, message), message
     assert snapshot(site) == before
     assert not (tmp_path / "points.laz").exists()
+
+
+def test_a_folder_of_flights_is_refused_and_names_them(good, site, tmp_path, capsys):
+    for name in ("one", "two"):
+        shutil.copytree(good, tmp_path / "flights" / name)
+    assert main(["add", str(site), "2024-05-01", str(tmp_path / "flights"), "--quiet"]) == 65
+    message = capsys.readouterr().err
+    assert "one, two" in message
+    assert f"changedetect add {site} EPOCH_ID {tmp_path / 'flights' / 'one'}" in message
+    assert main(["reconstruct", str(tmp_path / "flights"), "-o", str(tmp_path / "p.laz"), "--quiet"]) == 65
+    assert f"one, two. Name the flight, such as {tmp_path / 'flights' / 'one'}" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["flights"]
 
 
 def few_zero_fixes(flight):

@@ -26,6 +26,7 @@ from changedetect.photogrammetry.tracks import TrackSettings
 from changedetect.pipeline import reconstruct as pipeline
 from changedetect.pipeline.flight_run import FlightRun, FlightSource, read_flight_source
 from changedetect.pipeline.flight_store import FlightStore, key_of
+from changedetect.pipeline.photo_agreement import check_agreement
 from changedetect.pipeline.reconstruct import ReconstructOptions, output_crs, reconstruct
 
 DATA = Path(os.environ.get("CHANGEDETECT_DATA", "../shared/data"))
@@ -111,12 +112,36 @@ def test_points_are_written_with_sigma_and_views(source, finished, tmp_path, mon
         reconstruct([tmp_path], output, ReconstructOptions())
 
 
+def turned(adjustment, in_camera):
+    """The adjustment with attitudes that deviate by rotations, rad, about the axes of the cameras."""
+    deviation = np.zeros_like(adjustment.pose_correction)
+    deviation[:, 3:] = np.einsum("nij,nj->ni", adjustment.block.rotation, in_camera)
+    return replace(adjustment, pose_correction=deviation, prior_chi2=500.0)
+
+
+def test_a_camera_mounted_askew_is_warned_of_and_photos_of_another_flight_are_refused(finished, caplog):
+    adjustment = finished.oriented.adjustment
+    images, points = np.arange(len(adjustment.block)), np.arange(len(adjustment.points))
+    askew = np.tile(np.radians([6.0, -6.0, 6.0]), (images.size, 1))
+    check_agreement(finished, turned(adjustment, askew), images, points)
+    assert "contradict each other" in caplog.text
+    others = np.random.default_rng(0).normal(0.0, np.radians(3.0), (images.size, 3))
+    with pytest.raises(InputDataError, match=r"flight: from photo to photo .*put those of this flight into its folder"):
+        check_agreement(finished, turned(adjustment, others), images, points)
+
+
+def test_photos_that_leave_hardly_any_points_are_refused(finished):
+    adjustment = finished.oriented.adjustment
+    with pytest.raises(InputDataError, match=r"only 4 points fit the photos.*in the order that their list says"):
+        check_agreement(finished, adjustment, np.arange(len(adjustment.block)), np.arange(4))
+
+
 def test_flights_whose_photos_have_the_same_names_keep_their_own(tmp_path, monkeypatch):
     runs, truths = [], []
     for k in range(2):
         folder = tmp_path / f"flight{k}"
         folder.mkdir()
-        flown = rendered.fly(k, n_photos=4)
+        flown = rendered.fly(k, n_photos=3)
         for name, grey in zip(flown.truth.names, flown.photos, strict=True):
             cv2.imwrite(str(folder / name), grey)
         poses = rendered.perturbed(flown.truth, 100 + k)

@@ -94,6 +94,13 @@ def test_what_cannot_be_meant_is_refused(site, capsys, tmp_path):
     assert (tmp_path / "v.csv").read_text() == "kept"
 
 
+def test_zones_are_not_overwritten_with_their_budgets(site, zones, capsys):
+    before = zones.read_bytes()
+    done = run(capsys, "volume", site, FIRST, SECOND, "--zones", zones, "-o", zones, "--overwrite", expect=2)
+    assert "read and written at once" in done["error"]["message"]
+    assert zones.read_bytes() == before
+
+
 def stable_site(folder, box):
     path = write_zones(folder / "stable.gpkg", [box], ["road"])
     programme = make_programme(folder / "site", {FIRST: {}, SECOND: {"step": 0.5}})

@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 
 #: Folders in `flights/EPOCH_ID/`: points with their manifest, whole or absent; steps, which may be deleted.
 POINTS_FOLDER, STEPS_FOLDER = "points", "steps"
+#: Folders of a programme that only its own commands write into.
+_KEPT_FOLDERS = ("epochs", "flights", "products", "runs", "sources", "state")
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,11 @@ class Programme:
         """File of polygons that do not change, if the settings name one."""
         name = self.config.coregistration.stable_areas
         return None if name is None else self.directory / Path(name).expanduser()
+
+    def keeps(self, path: Path) -> Path | None:
+        """Folder of the programme that a path lies in, or is, and that only its own commands write into; else None."""
+        kept = [self.directory / name for name in _KEPT_FOLDERS]
+        return next((folder for folder in kept if path.resolve().is_relative_to(folder.resolve())), None)
 
     def state_directory(self, epoch_id: str) -> Path:
         """Where the model of an epoch lies."""

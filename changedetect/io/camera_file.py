@@ -108,7 +108,7 @@ def _load(path: Path) -> dict[str, Any]:
     try:
         document = yaml.load(text, Loader=_Loader)  # a SafeLoader
     except yaml.YAMLError as error:
-        msg = f"{path} is not YAML: {' '.join(str(error).split())}"
+        msg = f"{path} is not YAML: {' '.join(str(error).split())}. Correct it, or export the calibration again."
         raise InputDataError(msg) from error
     if not isinstance(document, dict):
         msg = f"{path} holds no camera: expected keys image_width, image_height, camera_matrix."

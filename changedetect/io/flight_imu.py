@@ -117,7 +117,7 @@ def make_imu_log(
         Too few samples, time that runs backwards, two different samples with one stamp, a gap above 0.5 s, units or
         axes that cannot be right, or more than 2 % of the samples saturated.
     """
-    rows = _without_repeats(path, line, time, rate, force)
+    rows = _without_repeats(path, line, time, rate, force) if time.size else np.zeros(0, bool)
     line, time, rate, force = line[rows], time[rows], rate[rows].copy(), force[rows].copy()
     if time.size < 10:
         msg = f"{path} has {time.size} inertial samples; at least 10 are needed. Export the whole log."

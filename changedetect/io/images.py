@@ -128,7 +128,8 @@ def photo_size(path: Path) -> tuple[int, int]:
             with rasterio.open(path) as dataset:
                 return int(dataset.width), int(dataset.height)
     except RasterioIOError as error:
-        msg = f"{path} cannot be read as a picture: {error}. Copy it again from the camera, or remove it from the list."
+        reason = str(error).rstrip(".")
+        msg = f"{path} cannot be read as a picture: {reason}. Copy it again from the camera, or take it off the list."
         raise InputDataError(msg) from error
 
 
@@ -137,7 +138,7 @@ def _read_grey(path: Path, reduction: int) -> NDArray[np.uint8]:
         _require_whole_jpeg(path)
     grey = cv2.imread(str(path), _READ[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
     if grey is None:
-        msg = f"{path} cannot be decoded. Copy it again from the camera, or remove it from the list."
+        msg = f"{path} cannot be decoded. Copy it again from the camera, or take it off the list."
         raise InputDataError(msg)
     return np.asarray(grey, dtype=np.uint8)
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from changedetect.io.photo_metadata import PhotoMetadata
 
-__all__ = ["check_one_camera", "check_one_flight", "in_order", "with_positions"]
+__all__ = ["check_copies", "check_one_camera", "check_one_flight", "in_order", "with_positions"]
 
 logger = logging.getLogger(__name__)
 
@@ -135,20 +135,26 @@ def check_one_flight(directory: Path, photos: Sequence[PhotoMetadata]) -> None:
             f"flights are in {directory}. Ground changes between flights: give each a folder of its own."
         )
         raise InputDataError(msg)
-    _check_copies(photos)
+    check_copies([photo.path for photo in photos])
 
 
-def _check_copies(photos: Sequence[PhotoMetadata]) -> None:
-    """A photo that is there twice would count twice."""
-    seen: dict[tuple[float | None, float | None, float | None], list[PhotoMetadata]] = {}
-    for photo in photos:
-        seen.setdefault((photo.time, photo.latitude, photo.longitude), []).append(photo)
-    for group in seen.values():
+def check_copies(paths: Sequence[Path]) -> None:
+    """
+    Refuse a photo that is there twice, whatever its names: it would count twice.
+
+    Raises
+    ------
+    InputDataError
+    """
+    of_size: dict[int, list[Path]] = {}
+    for path in paths:
+        of_size.setdefault(path.stat().st_size, []).append(path)
+    for group in of_size.values():
         if len(group) < 2:
             continue
-        first: dict[str, PhotoMetadata] = {}
-        for photo in group:
-            other = first.setdefault(sha256_of_file(photo.path), photo)
-            if other is not photo:
-                msg = f"{photo.path} is a copy of {other.path.name}. Remove one of them."
+        first: dict[str, Path] = {}
+        for path in group:
+            other = first.setdefault(sha256_of_file(path), path)
+            if other is not path:
+                msg = f"{path} is a copy of {other.name}. Put the right picture there, or remove one of them."
                 raise InputDataError(msg)

@@ -51,6 +51,8 @@ Step = Callable[[int, int, str], None]
 _BORESIGHT_STD = float(np.radians(0.3))
 #: Fewest points with three views that a flight needs.
 _MIN_POINTS = 50
+#: Share of the usual number of observations below which a photo hardly takes part; false matches leave 2 %.
+_LONELY = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -359,10 +361,15 @@ def _require_matches(block: ImageBlock, tracks: Observations, ties: Observations
             "time."
         )
         raise InputDataError(msg)
-    lonely = np.flatnonzero(per_photo < 4)
+    lonely = np.flatnonzero(per_photo < max(4.0, _LONELY * float(np.median(per_photo))))
     if lonely.size:
         names = ", ".join(block.names[i] for i in lonely[:5])
-        logger.warning("%d photos share less than four points with others and keep their poses: %s", lonely.size, names)
+        logger.warning(
+            "%d photos share hardly any points with the others and keep the poses they were given (out of order, of "
+            "other ground, blurred, or over water?): %s",
+            lonely.size,
+            names,
+        )
 
 
 def _counter(on_step: Step | None, total: int, label: str) -> Callable[[], None] | None:

@@ -31,8 +31,9 @@ from changedetect.pipeline.flight_inputs import check_files, flight_files, listi
 from changedetect.pipeline.flight_run import FlightRun, default_workers, read_flight_source
 from changedetect.pipeline.flight_store import FlightStore, load_finished, save_finished
 from changedetect.pipeline.manifest import utc_now
+from changedetect.pipeline.photo_agreement import check_agreement
 from changedetect.pipeline.photo_clock import with_camera_in_time
-from changedetect.pipeline.reconstruct import FlightPart, ReconstructOptions, warn_of_contradiction, write_flight
+from changedetect.pipeline.reconstruct import FlightPart, ReconstructOptions, write_flight
 from changedetect.storage import atomic_directory, sha256_of_file, write_json
 from changedetect.typing import FloatArray, JSONObject
 
@@ -122,15 +123,14 @@ def reconstruct_epoch(
         anchored = _anchored(run, epoch.epoch_id, anchors, warnings, is_demanded=config.flights.joint == "always")
         alone = FinishedFlight(run.oriented.adjustment, run.origin)
         finished = alone if anchored is None else anchored.finished
-        warn_of_contradiction(run, finished.adjustment)
     everything = np.arange(len(finished.adjustment.points))
+    part = FlightPart(finished.adjustment, everything)
+    check_agreement(run, part.adjustment, part.images, part.points)
     factor = error_factor(finished.adjustment.camera_covariance)
     error = common_error(point_modes(finished.adjustment, everything, factor))
     options = ReconstructOptions(dense=config.flights.dense)
     with atomic_directory(programme.flight_directory(epoch.epoch_id) / POINTS_FOLDER) as folder:
-        points, described = write_flight(
-            run, folder / POINTS_FILE, FlightPart(finished.adjustment, everything), config.crs, options
-        )
+        points, described = write_flight(run, folder / POINTS_FILE, part, config.crs, options)
         described["file"] = POINTS_FILE
         save_finished(folder / _ORIENTATION_FILE, finished)
         records = _anchor_records(programme, anchor_ids, anchored, run.origin)

@@ -18,7 +18,7 @@ from changedetect.storage import sha256_of_file
 if TYPE_CHECKING:
     from changedetect.pipeline.flight_run import FlightSource
 
-__all__ = ["check_files", "flight_date", "flight_files", "is_flight_folder", "listing_sha256"]
+__all__ = ["check_files", "flight_date", "flight_files", "flights_below", "is_flight_folder", "listing_sha256"]
 
 logger = logging.getLogger(__name__)
 
@@ -41,6 +41,13 @@ def is_flight_folder(path: Path) -> bool:
         for folder in folders
         for file in folder.iterdir()
     )
+
+
+def flights_below(directory: Path) -> list[str]:
+    """Names of the folders in a folder that are flights; none where it is no folder, or a flight itself."""
+    if not directory.is_dir() or is_flight_folder(directory):
+        return []
+    return [folder.name for folder in sorted(directory.iterdir()) if is_flight_folder(folder)]
 
 
 def flight_files(directory: Path, source: FlightSource) -> dict[str, Path]:

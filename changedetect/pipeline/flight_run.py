@@ -14,6 +14,7 @@ import numpy as np
 from changedetect.errors import InputDataError
 from changedetect.io.flight import read_flight
 from changedetect.io.images import PhotoFiles
+from changedetect.io.photo_checks import check_copies
 from changedetect.io.photo_folder import is_photo_folder
 from changedetect.navigation.camera import CameraIntrinsics
 from changedetect.navigation.flight import Flight
@@ -201,7 +202,8 @@ class FlightRun:
 
     @cached_property
     def photos(self) -> PhotoFiles:
-        """Photos, checked against the camera file."""
+        """Photos, checked against the camera file and each other."""
+        check_copies(self.source.paths)
         source, factor = self.source, self.source.reduction
         size = source.camera.width * factor, source.camera.height * factor
         return PhotoFiles(source.paths, size, source.camera_file, factor)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from changedetect.catalogue import Epoch, Programme, Source, parse_date, validate_epoch_id
 from changedetect.errors import ConfigError, InputDataError, MissingInputError, OutputExistsError
-from changedetect.pipeline.flight_inputs import is_flight_folder
+from changedetect.pipeline.flight_inputs import flights_below, is_flight_folder
 from changedetect.pipeline.lock import programme_lock
 from changedetect.pipeline.reading import read_epoch_points
 from changedetect.pipeline.regions import describe_region, regions_overlap, unit_hint
@@ -134,7 +134,7 @@ def _described(programme: Programme, source: Source) -> Source:
     """Return the source with its checksum, its path as the programme is to remember it."""
     path = Path(source.uri).expanduser().resolve()
     if path.is_dir():
-        flights = [folder.name for folder in sorted(path.iterdir()) if is_flight_folder(folder)]
+        flights = flights_below(path)
         if flights:
             msg = (
                 f"'{source.uri}' holds {'flights' if len(flights) > 1 else 'a flight'} in folders: "

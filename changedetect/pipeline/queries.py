@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from changedetect.catalogue import MANIFEST_FILE, Programme, plan
+from changedetect.catalogue import ProductRecord, Programme, plan
 from changedetect.errors import InputDataError, MissingInputError, OutputExistsError, UsageError
 from changedetect.io.cog import write_cog
 from changedetect.io.netcdf import SURFACE_LAYERS, SurfaceMetadata, write_surface
@@ -89,7 +89,8 @@ def predict_table(
         The output exists.
     """
     require_suffix(output, (".csv",), "Predictions are written as a CSV table.")
-    require_absent(output, overwrite=overwrite)
+    require_outside(programme, output)
+    require_absent(output, overwrite=overwrite, source=points)
     model = ModelShelf(programme).get(epoch_id)
     header = ("easting", "northing", *PREDICTED_COLUMNS)
     n_points = n_unknown = 0
@@ -149,6 +150,7 @@ def write_epoch_surface(
         The output exists.
     """
     require_suffix(output, (".tif", ".tiff", ".nc"), "GeoTIFF holds one layer, NetCDF all of them.")
+    require_outside(programme, output)
     require_absent(output, overwrite=overwrite)
     config, epoch = programme.config, programme.epoch(epoch_id)
     model = ModelShelf(programme).get(epoch_id)
@@ -210,11 +212,12 @@ def difference_epochs(
     Raises
     ------
     UsageError
-        The folder has the name of a file.
+        The folder has the name of a file, or is one of those that the programme keeps.
     OutputExistsError
         The folder holds something else, or `overwrite` is not set.
     """
     require_suffix(directory, (), "A difference is written as a folder of maps.")
+    require_outside(programme, directory)
     require_replaceable(directory, overwrite=overwrite)
     pair = programme.pair(earlier, later)
     if dry_run:
@@ -247,14 +250,33 @@ def require_suffix(output: Path, suffixes: Sequence[str], content: str) -> None:
         raise UsageError(msg)
 
 
-def require_absent(output: Path, *, overwrite: bool) -> None:
+def require_outside(programme: Programme, output: Path) -> None:
     """
-    Refuse to replace a file unless asked to.
+    Refuse an output inside the folders that a programme keeps: it would replace a model or a product.
+
+    Raises
+    ------
+    UsageError
+    """
+    kept = programme.keeps(output)
+    if kept is not None:
+        msg = f"'{output}' lies in '{kept}', which the programme keeps for itself. Name a place outside of it."
+        raise UsageError(msg)
+
+
+def require_absent(output: Path, *, overwrite: bool, source: Path | None = None) -> None:
+    """
+    Refuse to replace a file unless asked to, and to replace the one that is read at all.
 
     Raises
     ------
     OutputExistsError
+    UsageError
+        The output is the source.
     """
+    if source is not None and output.exists() and source.exists() and output.samefile(source):
+        msg = f"'{output}' is to be read and written at once. Choose another name for the output."
+        raise UsageError(msg)
     if output.is_dir():
         msg = f"'{output}' is a folder; name a file."
         raise OutputExistsError(msg)
@@ -273,12 +295,19 @@ def require_replaceable(directory: Path, *, overwrite: bool) -> None:
     """
     if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
         return
-    if not (directory / MANIFEST_FILE).is_file():
+    if not _holds_products(directory):
         msg = f"'{directory}' exists and holds something else than products. Choose another folder."
         raise OutputExistsError(msg)
     if not overwrite:
         msg = f"'{directory}' holds products already. Choose another folder, or pass --overwrite to replace them."
         raise OutputExistsError(msg)
+
+
+def _holds_products(directory: Path) -> bool:
+    try:
+        return ProductRecord.read(directory) is not None
+    except InputDataError:  # the manifest of something else
+        return False
 
 
 @contextmanager

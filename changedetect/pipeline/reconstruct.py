@@ -25,6 +25,7 @@ from changedetect.photogrammetry.control import ControlPoint
 from changedetect.photogrammetry.covariance import PointUncertainty, flight_difference, point_uncertainty
 from changedetect.photogrammetry.dense import DensePoints, dense_points
 from changedetect.photogrammetry.orientation import OrientationSettings, OrientedTogether, Step, orient_together
+from changedetect.pipeline.flight_inputs import flights_below
 from changedetect.pipeline.flight_run import (
     METHODS,
     FlightRun,
@@ -33,6 +34,7 @@ from changedetect.pipeline.flight_run import (
     read_flight_source,
 )
 from changedetect.pipeline.flight_store import FlightStore
+from changedetect.pipeline.photo_agreement import check_agreement
 from changedetect.pipeline.photo_clock import with_camera_in_time
 from changedetect.pipeline.queries import require_absent, require_suffix
 from changedetect.pointcloud import PointCloud
@@ -45,7 +47,6 @@ __all__ = [
     "ReconstructOptions",
     "output_crs",
     "reconstruct",
-    "warn_of_contradiction",
     "write_flight",
 ]
 
@@ -53,8 +54,6 @@ logger = logging.getLogger(__name__)
 
 #: WGS 84 with ellipsoidal heights: what GPS and the local frame refer to.
 _GEODETIC = "EPSG:4979"
-#: Deviation of adjusted from navigated poses, over its variance, beyond which a user is warned.
-_MAX_PRIOR_CHI2 = 4.0
 _REPORT_SUFFIX = ".report.json"
 
 
@@ -207,7 +206,7 @@ def reconstruct(
         runs = [with_camera_in_time(run, path, camera_file=options.camera_file) for run, path in folders]
     together, parts = _oriented(runs, options)
     for run, part in zip(runs, parts, strict=True):
-        warn_of_contradiction(run, part.adjustment)
+        check_agreement(run, part.adjustment, part.images, part.points)
     for run, file, part in zip(runs, files, parts, strict=True):
         _, described = write_flight(run, file, part, crs, options)
         report["flights"].append(described)
@@ -302,6 +301,14 @@ def _report_file(output: Path, n_flights: int) -> Path:
 def _runs(
     directories: Sequence[Path], files: Sequence[Path], output: Path, options: ReconstructOptions, on_step: Step | None
 ) -> list[FlightRun]:
+    for directory in directories:
+        flights = flights_below(directory)
+        if flights:
+            msg = (
+                f"'{directory}' is no flight but holds {'some' if len(flights) > 1 else 'one'}: {', '.join(flights)}. "
+                f"Name the flight, such as {directory / flights[0]}; several are adjusted together into a folder."
+            )
+            raise InputDataError(msg)
     work = options.work or output.with_name(f"{output.name}.work")
     settings = OrientationSettings(workers=default_workers(options.workers))
     runs: list[FlightRun] = []
@@ -414,18 +421,6 @@ def _dense(run: FlightRun, part: FlightPart) -> DensePoints:
         workers=run.settings.workers,
         on_tile=on_tile,
     )
-
-
-def warn_of_contradiction(run: FlightRun, adjustment: Adjustment) -> None:
-    """Warn where adjusted poses deviate from navigation by more than its covariance allows."""
-    if adjustment.prior_chi2 > _MAX_PRIOR_CHI2:
-        logger.warning(
-            "%s: photos and navigation contradict each other (squared deviation of the poses %.1f times what their "
-            "covariance allows). Check the clock of the camera, its mounting, the camera file, and whether photos and "
-            "logs are of one flight",
-            run.source.label,
-            adjustment.prior_chi2,
-        )
 
 
 def _adjusted_poses(run: FlightRun, part: FlightPart) -> CameraPoses:

@@ -20,7 +20,7 @@ from changedetect.io.series import SERIES_CLASSES, SeriesMetadata, ZoneSeries, w
 from changedetect.io.zones import covered_cells, read_zones
 from changedetect.pipeline.learn import ModelShelf, learned_region
 from changedetect.pipeline.manifest import new_run_id, utc_now
-from changedetect.pipeline.queries import require_absent, require_suffix
+from changedetect.pipeline.queries import require_absent, require_outside, require_suffix
 from changedetect.pipeline.rasters import product_grid
 from changedetect.pipeline.regions import describe_region
 from changedetect.pipeline.stacking import add_errors, stack_epochs
@@ -138,6 +138,7 @@ def make_series(
         An output exists, or cannot be written.
     """
     files = _files(output, with_zones=zones is not None)
+    require_outside(programme, output)
     for path in files.values():
         require_absent(path, overwrite=overwrite)
     epochs, warnings = _learned_epochs(programme)

@@ -15,7 +15,7 @@ from changedetect.io.zones import covered_cells, read_zones
 from changedetect.pipeline.learn import ModelShelf, learned_region
 from changedetect.pipeline.pairs import difference_pair
 from changedetect.pipeline.products import offset_warning
-from changedetect.pipeline.queries import require_absent, require_suffix
+from changedetect.pipeline.queries import require_absent, require_outside, require_suffix
 from changedetect.pipeline.rasters import product_grid
 from changedetect.storage import atomic_path
 
@@ -84,7 +84,8 @@ def measure_volumes(
         if output.suffix.lower() == ".gpkg" and zones is None:
             msg = f"'{output}' is to hold zones with their budgets: name them with --zones, or write a .csv."
             raise UsageError(msg)
-        require_absent(output, overwrite=overwrite)
+        require_outside(programme, output)
+        require_absent(output, overwrite=overwrite, source=zones)
     config = programme.config
     programme.pair(earlier, later)
     listed = () if zones is None else read_zones(zones, config.crs, layer=layer, name_column=name_column)

@@ -231,6 +231,22 @@ def test_diff_writes_the_same_maps_as_update(tmp_path, site, capsys):
     assert f"in this order: {FIRST} {SECOND}" in error["message"]
 
 
+def test_outputs_do_not_replace_what_the_programme_keeps(tmp_path, site, capsys):
+    before = snapshot(site)
+    for command in (
+        ("diff", site, FIRST, SECOND, "-o", site / "state" / FIRST, "--overwrite"),
+        ("diff", site, FIRST, SECOND, "-o", site / "products" / FIRST, "--overwrite"),
+        ("surface", site, FIRST, "-o", site / "products" / FIRST / "elevation.tif", "--overwrite"),
+        ("series", site, "-o", site / "state" / FIRST / "model.nc", "--overwrite"),
+        ("volume", site, FIRST, SECOND, "-o", site / "runs" / "volumes.csv"),
+    ):
+        assert "which the programme keeps for itself" in run(capsys, *command, expect=2)["error"]["message"]
+    shutil.copytree(site / "state" / FIRST, tmp_path / "model")
+    error = run(capsys, "diff", site, FIRST, SECOND, "-o", tmp_path / "model", "--overwrite", expect=73)["error"]
+    assert "holds something else than products" in error["message"]
+    assert snapshot(site) == before
+
+
 def test_a_model_that_is_not_current_is_used_with_a_warning(tmp_path, site, capsys):
     path = site / "epochs" / f"{FIRST}.toml"
     path.write_text(path.read_text() + "sigma = 0.05\n")
