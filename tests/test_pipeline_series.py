@@ -17,6 +17,7 @@ from changedetect.cli import main
 from changedetect.io.cog import read_cog
 from changedetect.io.series import CELL_LAYERS, SERIES_CLASSES, TIME_LAYERS
 from changedetect.pipeline.update import update
+from changedetect.storage import read_json
 
 DATES = ["2023-01-01", "2023-03-01", "2023-06-01", "2023-09-01", "2024-01-01", "2024-04-01"]
 CLASS = {c.meaning: c.value for c in SERIES_CLASSES}
@@ -247,6 +248,13 @@ def test_surveys_of_different_ground_have_nothing_in_common(tmp_path, capsys):
     text = (programme.directory / "programme.toml").read_text()
     (programme.directory / "programme.toml").write_text(f"{text}\n[coregistration]\nenabled = false\n")
     run(capsys, "update", programme.directory)
+    summary = read_json(programme.directory / "products" / f"{DATES[0]}_{DATES[1]}" / "summary.json")
+    assert summary["warnings"] == ["no ground was observed by both epochs: the maps hold no difference"]
+    for command in (("diff", "-o", tmp_path / "maps"), ("volume", "-o", tmp_path / "volumes.csv")):
+        verb, *output = command
+        error = run(capsys, verb, programme.directory, *DATES[:2], *output, expect=65)["error"]
+        assert f"Epochs {DATES[0]} and {DATES[1]} of '{programme.directory}' observed no ground" in error["message"]
+        assert not output[1].exists()
     done = run(capsys, "series", programme.directory, "-o", tmp_path / "s.nc")
     assert done["area_m2"]["too_few_surveys"] > 700.0
     assert sum(done["area_m2"].values()) == done["area_m2"]["too_few_surveys"]

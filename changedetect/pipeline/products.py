@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import changedetect
 from changedetect.catalogue import ChangeProduct, ProductRecord, Programme, describe_files
-from changedetect.errors import ModelStateError
+from changedetect.errors import InputDataError, ModelStateError
 from changedetect.grid import Grid
 from changedetect.io.geopackage import write_objects
 from changedetect.io.netcdf import CHANGE_LAYERS
@@ -27,6 +27,7 @@ from changedetect.pipeline.learn import ModelShelf
 from changedetect.pipeline.manifest import utc_now
 from changedetect.pipeline.pairs import difference_pair
 from changedetect.pipeline.rasters import predict_layers, product_grid
+from changedetect.pipeline.regions import describe_region
 from changedetect.pipeline.stac import write_item
 from changedetect.storage import read_json, write_json
 from changedetect.typing import JSONObject
@@ -34,9 +35,9 @@ from changedetect.typing import JSONObject
 __all__ = [
     "OBJECTS_FILE",
     "SUMMARY_FILE",
+    "difference_warning",
     "make_epoch_products",
     "make_pair_products",
-    "offset_warning",
     "predict_layers",
     "product_grid",
 ]
@@ -107,11 +108,18 @@ def make_pair_products(
     details : dict
         For the run's manifest; `warnings` is a list of what people should know, `summary` what the folder's
         `summary.json` says.
+
+    Raises
+    ------
+    InputDataError
+        The epochs have no ground in common, and a folder was asked for; the programme's own product says so.
     """
     config = programme.config
     difference = difference_pair(programme, pair.earlier, pair.later, models)
     grid, maps, objects, statistics = difference.grid, difference.maps, difference.objects, difference.summary
-    warning = offset_warning(statistics)
+    if directory is not None:
+        require_common_ground(programme, pair, statistics)
+    warning = difference_warning(statistics)
     warnings = (warning,) if warning else ()
     epochs = [programme.epoch(pair.earlier), programme.epoch(pair.later)]
     summary: JSONObject = {
@@ -173,15 +181,44 @@ def make_pair_products(
     }
 
 
-def offset_warning(summary: JSONObject) -> str | None:
+def require_common_ground(programme: Programme, pair: ChangeProduct, summary: JSONObject) -> None:
     """
-    Say in words that two epochs differ by a constant, if `summarise` found that they do.
+    Refuse a difference that holds nothing.
+
+    Parameters
+    ----------
+    programme : Programme
+    pair : ChangeProduct
+    summary : dict
+        As `changedetect.differencing.summarise` returns it.
+
+    Raises
+    ------
+    InputDataError
+        No ground was observed by both epochs.
+    """
+    if summary["area_observed_m2"] > 0.0:
+        return
+    epochs = [programme.epoch(epoch_id) for epoch_id in (pair.earlier, pair.later)]
+    spans = [f"{epoch.epoch_id} spans {describe_region(epoch.region)}" for epoch in epochs if epoch.region is not None]
+    msg = (
+        f"Epochs {pair.earlier} and {pair.later} of '{programme.directory}' observed no ground in common"
+        f"{': ' if spans else ''}{', '.join(spans)}. Choose epochs that overlap, or wider bounds."
+    )
+    raise InputDataError(msg)
+
+
+def difference_warning(summary: JSONObject) -> str | None:
+    """
+    Say in words that two epochs share no ground, or differ by a constant, if `summarise` found that they do.
 
     Parameters
     ----------
     summary : dict
         As `changedetect.differencing.summarise` returns it.
     """
+    if not summary["area_observed_m2"] > 0.0:
+        return "no ground was observed by both epochs: the maps hold no difference"
     offset = summary["systematic_offset_m"]
     if offset is None:
         return None

@@ -44,7 +44,7 @@ def product_grid(
         msg = f"Bounds are west east south north with west < east and south < north, not {west} {east} {south} {north}."
         raise ConfigError(msg)
     if common_ground((west, east, south, north), region) is None:
-        which = "Bounds given (--bounds)" if bounds else "The bounds in programme.toml"
+        which = "Bounds given (--bounds)" if bounds else "The bounds of the settings (see `changedetect config show`)"
         msg = (
             f"{which} hold no data: they are {describe_region((west, east, south, north))}, the data span "
             f"{describe_region(region)} in {config.crs}. Give west east south north in this CRS, or leave them out."

@@ -14,7 +14,7 @@ from changedetect.io.geopackage import write_zone_budgets
 from changedetect.io.zones import covered_cells, read_zones
 from changedetect.pipeline.learn import ModelShelf, learned_region
 from changedetect.pipeline.pairs import difference_pair
-from changedetect.pipeline.products import offset_warning
+from changedetect.pipeline.products import difference_warning, require_common_ground
 from changedetect.pipeline.queries import require_absent, require_outside, require_suffix
 from changedetect.pipeline.rasters import product_grid
 from changedetect.storage import atomic_path
@@ -75,7 +75,7 @@ def measure_volumes(
     UsageError
         The output ends neither in ``.csv`` nor in ``.gpkg``, or is to hold zones and none are named.
     MissingInputError, InputDataError, CRSMismatchError
-        The zones cannot be used.
+        The zones cannot be used; or the epochs observed no ground in common.
     OutputExistsError
         The output exists.
     """
@@ -87,7 +87,7 @@ def measure_volumes(
         require_outside(programme, output)
         require_absent(output, overwrite=overwrite, source=zones)
     config = programme.config
-    programme.pair(earlier, later)
+    pair = programme.pair(earlier, later)
     listed = () if zones is None else read_zones(zones, config.crs, layer=layer, name_column=name_column)
     if dry_run:
         grid = product_grid(config, learned_region(programme, (earlier, later)))
@@ -97,7 +97,8 @@ def measure_volumes(
     difference = difference_pair(programme, earlier, later, ModelShelf(programme))
     grid, maps, direction = difference.grid, difference.maps, difference.objects.direction
     confidence = config.differencing.confidence
-    warning = offset_warning(difference.summary)
+    require_common_ground(programme, pair, difference.summary)
+    warning = difference_warning(difference.summary)
     warnings = [warning] if warning else []
     budgets = [_zone_budget(zone, maps, grid, direction, confidence) for zone in listed]
     warnings += [
