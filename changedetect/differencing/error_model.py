@@ -176,7 +176,7 @@ def estimate_errors(
     if np.count_nonzero(ground) < _LEAST_CELLS:
         return model, ground
     for k in range(_ROUNDS):
-        model = _estimate_round(difference, variance, covariates, ground, resolution, model, is_first=k == 0)
+        model = _estimate_round(difference, variance, covariates, ground, resolution, model, n_before=k)
         if stable is None and k < _ROUNDS - 1:
             correlated = model.correlated_variance(covariates, difference.shape)
             correlations = (model.local, model.correlation.normalised())
@@ -211,7 +211,9 @@ def _estimate_again(
     """
     changed = known & ~ground
     for k in range(_LATER_ROUNDS + 1):
-        variances = (variance, np.where(known, model.correlated_variance(covariates, known.shape), 1.0))
+        # what is predicted has the whole variance, of which the scale of heavy tails is a part
+        correlated = max(model.correlation.variance, 1.0) * model.correlated_variance(covariates, known.shape)
+        variances = (variance, np.where(known, correlated, 1.0))
         correlations = (model.local, model.correlation.normalised())
         finest = standardise(np.where(known, difference, 0.0), variances, known, resolution)
         chosen = choose_stencil(correlations[1], correlations[0], finest)
@@ -226,7 +228,7 @@ def _estimate_again(
         ground = left
         if k == _LATER_ROUNDS:
             break
-        later = _estimate_round(difference, variance, covariates, ground, resolution, model, is_first=False)
+        later = _estimate_round(difference, variance, covariates, ground, resolution, model, n_before=_ROUNDS)
         if not later.is_correlated:
             break
         model = later
@@ -241,13 +243,17 @@ def _estimate_round(
     resolution: float,
     before: ErrorModel,
     *,
-    is_first: bool,
+    n_before: int,
 ) -> ErrorModel:
     rng = np.random.default_rng(11)
     area = float(np.count_nonzero(ground)) * resolution**2
     n_independent = max(area / max(_squared_area(before), resolution**2), 1.0)
     sample = _draw_sample(difference, variance, covariates, ground, resolution, n_independent, before, rng)
-    scale = fit_scale(sample, _FIRST_FREEDOM) if is_first else select_scale(sample)
+    if n_before == 0:
+        scale = fit_scale(sample, _FIRST_FREEDOM)
+    else:
+        # those of the first round were assumed
+        scale = select_scale(sample, before.scale.freedom if n_before > 1 else math.inf)
     cells = [np.asarray(values).ravel() for values in (difference, variance)]
     columns = {name: np.asarray(values).ravel() for name, values in covariates.items()}
 

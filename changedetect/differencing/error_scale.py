@@ -36,6 +36,8 @@ _LARGEST_COVARIATE = 3.0
 _LEAST_GAIN = 1.0
 #: ... and in standard errors of that gain.
 _LEAST_GAIN_ERRORS = 2.5
+#: Heavier tails stay with this gain, in its standard errors.
+_KEPT_GAIN_ERRORS = 1.0
 _N_FOLDS = 4
 
 
@@ -170,23 +172,33 @@ def fit_scale(sample: Sample, freedom: float) -> ErrorScale:
     )
 
 
-def select_scale(sample: Sample) -> ErrorScale:
+def select_scale(sample: Sample, before: float = math.inf) -> ErrorScale:
     """
     Scale with the tails that predict held-out blocks of ground best; normal ones unless others are clearly better.
 
     Parameters
     ----------
     sample : Sample
+    before : float
+        Degrees of freedom of the tails when change was looked for that is no longer in the sample.
 
     Returns
     -------
     scale : ErrorScale
+
+    Notes
+    -----
+    Tails that were heavy stay so unless normal ones are as good. Ground that is taken out for changed by normal tails
+    leaves tails that look normal, and less and less ground from round to round.
     """
     likelihood = {freedom: _held_out(sample, freedom) for freedom in _FREEDOMS}
     best = max(likelihood, key=lambda key: float(likelihood[key].sum()))
     gain = likelihood[best] - likelihood[math.inf]
     total, error = float(gain.sum()), math.sqrt(gain.size) * float(gain.std())
-    is_clear = total * sample.n_independent > _LEAST_GAIN and total > _LEAST_GAIN_ERRORS * error
+    if math.isinf(before):
+        is_clear = total * sample.n_independent > _LEAST_GAIN and total > _LEAST_GAIN_ERRORS * error
+    else:
+        is_clear = total > _KEPT_GAIN_ERRORS * error
     return fit_scale(sample, best if is_clear else math.inf)
 
 

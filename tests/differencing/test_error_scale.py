@@ -93,3 +93,11 @@ def test_heavy_tails_are_recognised_and_normal_ones_left_alone():
     assert heavy.freedom <= 4.0
     np.testing.assert_allclose(math.sqrt(heavy.variance({})), 0.04, rtol=0.15, atol=0.0)
     assert math.isinf(select_scale(sample(rng.normal(0.0, 0.04, 10_000))).freedom)
+
+
+def test_tails_that_were_heavy_stay_so_when_little_speaks_for_normal_ones():
+    rng = np.random.default_rng(12)
+    slightly = sample(0.04 * rng.standard_t(8.0, 10_000), n_independent=20.0)
+    assert math.isinf(select_scale(slightly).freedom)
+    assert select_scale(slightly, before=4.0).freedom <= 10.0
+    assert math.isinf(select_scale(sample(rng.normal(0.0, 0.04, 10_000)), before=4.0).freedom)
