@@ -288,8 +288,9 @@ class CommonErrorRecord:
     ----------
     centre : tuple (easting, northing), m
         Where the offset is that of the covariance.
-    covariance : 5 x 5 numbers
-        Of offset (m), tilt east, tilt north (m per m), shift east, shift north (m).
+    covariance : 8 x 8 numbers
+        Of offset (m), tilt east, tilt north (m per m), shift east, shift north (m), bending east, across, north (m per
+        m^2: of e^2, e n, n^2). Records of earlier versions hold the first five.
     residual_std : float, m
         What poses and lens leave after these, root mean square over the points.
     """

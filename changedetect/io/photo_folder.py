@@ -51,8 +51,10 @@ _LOGS = ("imu.csv", "gps.csv")
 _SUFFIXES = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 #: Of a GPS without corrections: what changes from photo to photo, and what the whole flight shares, m.
 _LEVEL_STD, _SHARED_LEVEL_STD = 1.5, 3.0
-#: Of a lens known from EXIF: relative focal length, principal point as a share of the width, k1, k2.
-_FOCAL_STD, _CENTRE_STD, _K1_STD, _K2_STD = 0.05, 0.015, 0.1, 0.1
+#: Of a lens known from EXIF: relative focal length, principal point as a share of the width; k1, k2, k3, p1, p2 and the
+#: relative difference of fx and fy.
+_FOCAL_STD, _CENTRE_STD = 0.05, 0.015
+_DISTORTION_STD = (0.1, 0.1, 0.1, 0.002, 0.002, 0.002)
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,8 @@ class PhotoFolder:
     camera : CameraIntrinsics
         Of the photos as they are.
     paths : tuple of path
-    lens_std : tuple of 5 float, optional
-        Of log focal length, cx, cy (pixels), k1, k2; None where a camera file states the lens.
+    lens_std : tuple of 9 float, optional
+        Of log focal length, cx, cy (pixels), k1, k2, k3, p1, p2, log fx / fy; None where a camera file states the lens.
     has_heading : array, shape (n,), bool
     camera_file : str
         Where the lens comes from.
@@ -79,7 +81,7 @@ class PhotoFolder:
     poses: CameraPoses
     camera: CameraIntrinsics
     paths: tuple[Path, ...]
-    lens_std: tuple[float, float, float, float, float] | None
+    lens_std: tuple[float, ...] | None
     has_heading: BoolArray
     camera_file: str
     description: dict[str, Any]
@@ -285,7 +287,7 @@ def _level_std(photos: Sequence[PhotoMetadata]) -> tuple[FloatArray, float]:
 
 def _camera(
     directory: Path, photos: Sequence[PhotoMetadata], camera_file: Path | None
-) -> tuple[CameraIntrinsics, CameraMount | None, tuple[float, float, float, float, float] | None, str]:
+) -> tuple[CameraIntrinsics, CameraMount | None, tuple[float, ...] | None, str]:
     """Lens, mounting, how well the lens is known (None: exactly), and where it comes from."""
     path = camera_file
     if path is None:
@@ -318,4 +320,4 @@ def _camera(
     width, height = first.width, first.height
     camera = CameraIntrinsics(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     centre = _CENTRE_STD * max(width, height)
-    return camera, None, (_FOCAL_STD, centre, centre, _K1_STD, _K2_STD), "EXIF"
+    return camera, None, (_FOCAL_STD, centre, centre, *_DISTORTION_STD), "EXIF"

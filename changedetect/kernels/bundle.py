@@ -2,9 +2,10 @@
 Normal equations of a bundle adjustment, with the ground points eliminated [1]_.
 
 Unknowns on the camera side, in this order: six for each image (position in m, small rotation vector in ground axes in
-rad), then five for each lens (log focal length, cx, cy, k1, k2). Each point adds a 3 x 3 block V and a coupling W; the
-Schur complement U - W V^-1 W^T leaves a dense system of the camera side alone, whose inverse is the marginal covariance
-of poses and lenses. Observations are sorted by point, then by image; those of point p are `start[p]` to `start[p + 1]`.
+rad), then nine for each lens (see `changedetect.kernels.projection.N_CALIBRATION`). Each point adds a 3 x 3 block V and
+a coupling W; the Schur complement U - W V^-1 W^T leaves a dense system of the camera side alone, whose inverse is the
+marginal covariance of poses and lenses. Observations are sorted by point, then by image; those of point p are
+`start[p]` to `start[p + 1]`.
 
 References
 ----------
@@ -123,7 +124,7 @@ def _couple(
     """
     Write the rows W of one point and the unknown each belongs to; return how many.
 
-    Poses give six rows a view; lenses five rows each, summed over the point's views.
+    Poses give six rows a view; lenses nine rows each, summed over the point's views.
     """
     n = 0
     for k in range(n_views):
@@ -188,7 +189,7 @@ def reduced_system(
 
     Returns
     -------
-    matrix : array, shape (n, n), with n = 6 n_images + 5 n_lenses
+    matrix : array, shape (n, n), with n = 6 n_images + 9 n_lenses
     gradient : array, shape (n,)
         Solve matrix @ step = gradient.
     """
@@ -303,7 +304,7 @@ def point_steps(
     ----------
     points, rotation, position, intrinsics, lens, start, image, pixel, weight, damping
         As `reduced_system`.
-    step : array, shape (6 n_images + 5 n_lenses,)
+    step : array, shape (6 n_images + 9 n_lenses,)
 
     Returns
     -------
@@ -352,7 +353,7 @@ def point_covariances(
     ----------
     points, rotation, position, intrinsics, lens, start, image, pixel, weight
         As `reduced_system`.
-    camera_covariance : array, shape (6 n_images + 5 n_lenses, 6 n_images + 5 n_lenses)
+    camera_covariance : array, shape (6 n_images + 9 n_lenses, 6 n_images + 9 n_lenses)
         Marginal covariance of the camera side.
 
     Returns
@@ -430,7 +431,7 @@ def coordinate_modes(
     ----------
     points, rotation, position, intrinsics, lens, start, image, pixel, weight
         As `reduced_system`.
-    modes : array, shape (6 n_images + 5 n_lenses, n_modes)
+    modes : array, shape (6 n_images + 9 n_lenses, n_modes)
         Columns: errors of the camera side.
     axis : int
         0 east, 1 north, 2 height.

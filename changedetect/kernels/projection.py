@@ -17,8 +17,9 @@ __all__ = ["N_CALIBRATION", "N_INTRINSICS", "distort", "project", "project_many"
 
 #: fx, fy, cx, cy, k1, k2, p1, p2, k3
 N_INTRINSICS = 9
-#: Parameters of a lens that an adjustment may estimate: log focal length, cx, cy, k1, k2.
-N_CALIBRATION = 5
+#: Parameters of a lens that an adjustment may estimate or doubt: log focal length, cx, cy, k1, k2, k3, p1, p2 and the
+#: logarithm of fx / fy.
+N_CALIBRATION = 9
 
 
 @njit(cache=True, error_model="numpy")
@@ -98,8 +99,8 @@ def projection_jacobian(
     by_pose : array, shape (2, 6)
         Overwritten: by the camera's position (m) and by a small rotation vector phi in ground axes (rad), where
         R_true = exp([phi]x) R.
-    by_lens : array, shape (2, 5)
-        Overwritten: by log focal length, cx, cy, k1, k2.
+    by_lens : array, shape (2, 9)
+        Overwritten: by log focal length, cx, cy, k1, k2, k3, p1, p2, log fx / fy.
 
     Returns
     -------
@@ -150,6 +151,10 @@ def projection_jacobian(
     by_lens[0, 2], by_lens[1, 2] = 0.0, 1.0
     by_lens[0, 3], by_lens[1, 3] = fx * x * r2, fy * y * r2
     by_lens[0, 4], by_lens[1, 4] = fx * x * r2 * r2, fy * y * r2 * r2
+    by_lens[0, 5], by_lens[1, 5] = fx * x * r2 * r2 * r2, fy * y * r2 * r2 * r2
+    by_lens[0, 6], by_lens[1, 6] = fx * 2.0 * x * y, fy * (r2 + 2.0 * y * y)
+    by_lens[0, 7], by_lens[1, 7] = fx * (r2 + 2.0 * x * x), fy * 2.0 * x * y
+    by_lens[0, 8], by_lens[1, 8] = 0.5 * fx * xd, -0.5 * fy * yd
     return fx * xd + intrinsics[2], fy * yd + intrinsics[3], zc
 
 

@@ -27,6 +27,7 @@ from changedetect.kernels.projection import N_CALIBRATION
 from changedetect.photogrammetry.block import ImageBlock, Observations
 from changedetect.photogrammetry.covariance import PixelCorrelation, pixel_correlation
 from changedetect.photogrammetry.lens import corrected_intrinsics, intrinsics_correction
+from changedetect.photogrammetry.lens_doubt import considered_covariance, contradiction, corner_units
 from changedetect.photogrammetry.priors import boresight_pattern
 from changedetect.photogrammetry.triangulation import are_determined, residuals, triangulate
 from changedetect.typing import BoolArray, FloatArray
@@ -36,7 +37,7 @@ __all__ = ["LENS_PARAMETERS", "Adjustment", "AdjustmentSettings", "adjust"]
 logger = logging.getLogger(__name__)
 
 #: Names of the lens parameters, in the order of the unknowns.
-LENS_PARAMETERS = ("focal", "cx", "cy", "k1", "k2")
+LENS_PARAMETERS = ("focal", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "aspect")
 #: Cauchy's constant with 95 % efficiency on normal errors.
 _CAUCHY = 2.385
 _MAX_ITERATIONS = 12
@@ -48,6 +49,8 @@ _CONTRADICTION = 20.0
 _MIN_SIGMA = 0.01
 #: Nor for worse than this many times what was stated: larger residuals speak against the poses, not the pixels.
 _MAX_SIGMA_RATIO = 3.0
+#: Variance over that known before beyond which a doubted lens parameter is named in the log.
+_TOLD_EXCESS = 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,11 +62,17 @@ class AdjustmentSettings:
     ----------
     lens : tuple of str
         Parameters estimated, of `LENS_PARAMETERS`; the others stay as given.
-    lens_std : tuple of 5 float
-        How well the given lens is known: relative focal length, cx and cy in pixels, k1, k2.
+    lens_std : tuple of 9 float
+        How well the given lens is known where it is adjusted: relative focal length, cx and cy in pixels, k1, k2, k3,
+        p1, p2, relative difference of fx and fy.
+    lens_doubt : float, pixels
+        What a lens that is not adjusted may at least err by in a corner of the photo, all parameters together; 0 takes
+        it as exact.
     max_share : float
         Parameters whose standard error does not fall to this share of `lens_std` go back to the value given: what the
         photos hardly determine takes up whatever the model lacks. Their `lens_std` enters the covariances.
+    heeds_contradiction : bool
+        Enlarge the variance of modes in which photos and navigation contradict each other.
     boresight_std : float, rad
         How well the mounting angles are known; 0 takes them as exact.
     rounds : int
@@ -75,7 +84,9 @@ class AdjustmentSettings:
     """
 
     lens: tuple[str, ...] = ()
-    lens_std: tuple[float, float, float, float, float] = (0.01, 10.0, 10.0, 0.05, 0.1)
+    lens_std: tuple[float, ...] = (0.01, 10.0, 10.0, 0.05, 0.1, 0.1, 0.002, 0.002, 0.002)
+    lens_doubt: float = 0.1
+    heeds_contradiction: bool = True
     max_share: float = 1.0
     boresight_std: float = 0.0
     rounds: int = 3
@@ -99,10 +110,12 @@ class Adjustment:
         Robust weights of the last iteration.
     origin : array, shape (n_points,), int64
         Number of each point among the observations given.
-    camera_covariance : array, shape (6 n_images + 5 n_lenses, 6 n_images + 5 n_lenses)
-        Marginal covariance of poses and lenses; zero for what was not adjusted.
-    lens_correction, lens_std : array, shape (n_lenses, 5)
-        Added to the lens given, and its standard error; of log focal length, cx, cy, k1, k2.
+    camera_covariance : array, shape (6 n_images + 9 n_lenses, 6 n_images + 9 n_lenses)
+        Marginal covariance of poses and lenses, the doubt about parameters not adjusted included.
+    lens_slope : array, shape (6 n_images + 9 n_lenses, 9 n_lenses)
+        How poses and lenses follow a change of each lens parameter that is not adjusted; zero for those adjusted.
+    lens_correction, lens_std : array, shape (n_lenses, 9)
+        Added to the lens given, and its standard error; in the order of `LENS_PARAMETERS`, focal lengths as logarithms.
     boresight, boresight_std : array, shape (n_flights, 3), rad
         Correction of the mounting angles about the camera's axes, and its standard error.
     pose_correction : array, shape (n_images, 6), m and rad
@@ -120,6 +133,7 @@ class Adjustment:
     weight: FloatArray
     origin: np.ndarray[Any, np.dtype[np.int64]]
     camera_covariance: FloatArray
+    lens_slope: FloatArray
     lens_correction: FloatArray
     lens_std: FloatArray
     boresight: FloatArray
@@ -199,8 +213,6 @@ class _Problem:
     boresight: FloatArray
     settings: AdjustmentSettings
     scale: float = 1.0
-    #: Lens parameters that stay as given although they are not known exactly; a mask of the unknowns.
-    considered: BoolArray | None = None
     #: Observations per independent one: what the images weigh less against the priors.
     inflation: float = 1.0
     #: Standard deviation given for each kind of observation, pixels.
@@ -294,19 +306,17 @@ class _Problem:
     def system(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal matrix, gradient and observation weights."""
         weight = self.weights() / self.inflation
+        whole, total = self.whole_matrix(weight, damping)
+        return whole[np.ix_(self.free, self.free)], total[self.free], weight
+
+    def whole_matrix(self, weight: FloatArray, damping: float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """Normal matrix and gradient of all unknowns, adjusted or not, with given observation weights."""
         system: Any = reduced_system
         matrix, gradient = system(*self.arrays(), weight, damping)
         whole, total = self.prior.copy(), -(self.prior @ self.deviation())
         whole[: self.n_reduced, : self.n_reduced] += matrix
         total[: self.n_reduced] += gradient
-        return whole[np.ix_(self.free, self.free)], total[self.free], weight
-
-    def whole_matrix(self, weight: FloatArray) -> FloatArray:
-        """Normal matrix of all unknowns, adjusted or not, with given observation weights."""
-        system: Any = reduced_system
-        whole = self.prior.copy()
-        whole[: self.n_reduced, : self.n_reduced] += system(*self.arrays(), weight, 0.0)[0]
-        return np.asarray(whole)
+        return whole, total
 
     def arrays(self) -> tuple[Any, ...]:
         b, o = self.block, self.observations
@@ -394,40 +404,48 @@ class _Problem:
             return False
         names = {LENS_PARAMETERS[k % N_CALIBRATION] for k in np.flatnonzero(poor[n : self.n_reduced])}
         logger.info("not determined by these photos, left as given: %s", ", ".join(sorted(names)))
-        self.free, self.considered = self.free & ~poor, poor
+        self.free = self.free & ~poor
         self.lens = np.where(poor[n : self.n_reduced].reshape(self.lens.shape), 0.0, self.lens)
         self.block = replace(self.block, intrinsics=corrected_intrinsics(self.given.intrinsics, self.lens))
         self.damping = 1e-8
         return True
 
     def covariance(self, weight: FloatArray) -> FloatArray:
-        """
-        Covariance of all unknowns, zero for those that are exact.
-
-        Notes
-        -----
-        With unknowns x adjusted and parameters c only considered, of prior covariance P and normal matrix N:
-        dx / dc = S = -N_xx^-1 N_xc, cov(x) = N_xx^-1 + S P S^T, cov(x, c) = S P (Schmidt's consider covariance).
-        """
-        whole = self.whole_matrix(weight / self.inflation)
-        out = np.zeros_like(whole)
+        """Covariance of the unknowns that are adjusted, zero for the others."""
         x = np.flatnonzero(self.free)
-        factor = _factor(whole[np.ix_(x, x)])
-        out[np.ix_(x, x)] = cho_solve(factor, np.eye(x.size))
-        if self.considered is not None:
-            c = np.flatnonzero(self.considered)
-            prior = np.diag(1.0 / np.diag(self.prior)[c])
-            slope = -cho_solve(factor, whole[np.ix_(x, c)])
-            out[np.ix_(x, x)] += slope @ prior @ slope.T
-            out[np.ix_(x, c)] = slope @ prior
-            out[np.ix_(c, x)] = out[np.ix_(x, c)].T
-            out[np.ix_(c, c)] = prior
+        whole = self.whole_matrix(weight / self.inflation)[0]
+        out = np.zeros_like(whole)
+        out[np.ix_(x, x)] = cho_solve(_factor(whole[np.ix_(x, x)]), np.eye(x.size))
         return out
+
+    def doubted_covariance(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Covariance of all unknowns, with the doubts about the lens, and how poses and lenses follow the lens."""
+        whole, gradient = self.whole_matrix(weight / self.inflation)
+        known, lens = self.known_lens(), slice(6 * len(self.block), self.n_reduced)
+        out, slope, variance = considered_covariance(whole, gradient, self.prior, self.free, known)
+        if self.settings.heeds_contradiction:
+            x = np.ix_(self.free, self.free)
+            out[x] += contradiction(whole[x], self.prior[x], self.deviation()[self.free])
+        for k in np.flatnonzero(variance > _TOLD_EXCESS * known):
+            name = LENS_PARAMETERS[(int(k) - lens.start) % N_CALIBRATION]
+            logger.info(
+                "photos contradict the %s given: ± %.2g instead of %.2g", name, *np.sqrt([variance[k], known[k]])
+            )
+        return out, slope[: self.n_reduced, lens]
+
+    def known_lens(self) -> FloatArray:
+        """Variance known before of each lens parameter that is not adjusted, zero for all other unknowns."""
+        stated = [name in self.settings.lens for name in LENS_PARAMETERS]
+        std = np.where(stated, self.settings.lens_std, self.settings.lens_doubt * corner_units(self.block))
+        known = np.zeros(len(self.prior))
+        known[6 * len(self.block) : self.n_reduced] = std.ravel() ** 2
+        known[self.free] = 0.0
+        return known
 
     def result(self) -> Adjustment:
         weight = self.weights()
         deviation = self.deviation()
-        covariance = self.covariance(weight)
+        covariance, lens_slope = self.doubted_covariance(weight)
         std = np.sqrt(np.diag(covariance))
         n = 6 * len(self.block)
         return Adjustment(
@@ -437,6 +455,7 @@ class _Problem:
             weight=weight,
             origin=self.origin,
             camera_covariance=covariance[: self.n_reduced, : self.n_reduced],
+            lens_slope=lens_slope,
             lens_correction=self.lens,
             lens_std=std[n : self.n_reduced].reshape(self.lens.shape),
             boresight=self.boresight,

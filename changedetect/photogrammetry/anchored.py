@@ -54,7 +54,7 @@ class FinishedFlight:
         Of this flight alone: its photos, lens and points.
     origin : LocalFrame
         Frame it is in.
-    cross : dict of str to array, shape (6 n + 5, 6 m + 5)
+    cross : dict of str to array, shape (6 n + 9, 6 m + 9)
         Covariance of its poses and lens with those of each flight it was adjusted to, by that flight's name; all axes
         are those of `origin`.
     """
@@ -208,6 +208,7 @@ class _Problem:
         inner = [_held_information(a) for a in held]
         self.information: FloatArray = block_diag(information, *inner)
         self.sizes = [len(block), *(len(a.block) for a in held)]
+        self._n_own_lens = N_CALIBRATION * len(lens.intrinsics)
         self.first = np.concatenate([[0], np.cumsum(self.sizes)]).astype(np.int64)
         self.features = [*features, *(f for anchor in anchors for f in anchor.features)]
 
@@ -261,7 +262,7 @@ class _Problem:
         names = (name, *(anchor.name for anchor in self.anchors))
         unmoved, moved = drop_changed(first.block, kept, settings.joint, names)
         before, after = count_shared(self.given, kept), count_shared(self.given, unmoved)
-        last = replace(settings.adjustment, lens=(), min_views=settings.min_views)
+        last = replace(settings.adjustment, lens=(), min_views=settings.min_views, heeds_contradiction=False)
         both = Observations.join([own, unmoved])
         final = adjust(self.given, both, self.information, last, start=first.block, on_round=on_round)
         covariance = self._considered(final)
@@ -290,17 +291,24 @@ class _Problem:
         n_images = int(self.first[-1])
         poses = np.arange(6 * self.first[flight], 6 * self.first[flight + 1])
         lenses = np.flatnonzero(np.isin(np.arange(len(self.given.intrinsics)), self._lenses(flight)))
-        inner = [6 * n_images + 5 * lens + np.arange(5) for lens in lenses]
+        inner = [6 * n_images + N_CALIBRATION * lens + np.arange(N_CALIBRATION) for lens in lenses]
         return np.concatenate([poses, *inner]).astype(np.int64)
 
     def _lenses(self, flight: int) -> IntArray:
         return np.unique(self.given.lens[self.first[flight] : self.first[flight + 1]])
 
     def _considered(self, final: Adjustment) -> FloatArray:
-        """Covariance of all poses and lenses, the held ones with the covariance they were published with."""
+        """
+        Covariance of all poses and lenses, the held ones with the covariance they were published with.
+
+        The new poses follow the held ones, their lenses and the new flight's lens, whose covariance is that of its
+        adjustment alone.
+        """
         new, n = self._rows(0), len(final.camera_covariance)
-        poses = np.arange(6 * self.first[1], 6 * self.first[-1])
-        narrow = final.camera_covariance
+        poses, lenses = np.arange(6 * self.first[1], 6 * self.first[-1]), np.arange(6 * self.first[-1], n)
+        held = np.concatenate([poses, lenses[self._n_own_lens :]])
+        doubt = np.diag(final.camera_covariance)[lenses] * np.any(final.lens_slope != 0, axis=0)
+        narrow = final.camera_covariance - (final.lens_slope * doubt) @ final.lens_slope.T
         cross = narrow[np.ix_(new, poses)]
         gain = np.linalg.solve(narrow[np.ix_(poses, poses)], cross.T).T
         out = np.zeros((n, n))
@@ -312,11 +320,14 @@ class _Problem:
                 if between is not None:
                     out[np.ix_(rows, self._rows(j))] = between
                     out[np.ix_(self._rows(j), rows)] = between.T
-        published = out[np.ix_(poses, poses)]
-        known = narrow[np.ix_(new, new)] - gain @ cross.T
-        out[np.ix_(new, new)] = known + gain @ published @ gain.T
-        out[np.ix_(new, poses)] = gain @ published
-        out[np.ix_(poses, new)] = out[np.ix_(new, poses)].T
+        own = self._n_own_lens
+        slope = final.lens_slope[new]
+        follows = np.hstack([gain, slope[:, own:]])
+        lens = self.oriented.adjustment.camera_covariance[-own:, -own:]
+        known = narrow[np.ix_(new, new)] - gain @ cross.T + slope[:, :own] @ lens @ slope[:, :own].T
+        out[np.ix_(new, new)] = known + follows @ out[np.ix_(held, held)] @ follows.T
+        out[np.ix_(new, held)] = follows @ out[np.ix_(held, held)]
+        out[np.ix_(held, new)] = out[np.ix_(new, held)].T
         return np.asarray(0.5 * (out + out.T))
 
     def _own_part(self, final: Adjustment, covariance: FloatArray, mine: IntArray) -> Adjustment:
@@ -349,7 +360,7 @@ class _Problem:
 
 
 def _turning(turn: FloatArray, size: int) -> FloatArray:
-    """Rotation of the axes of all poses, lens parameters (the last five) left alone."""
+    """Rotation of the axes of all poses, lens parameters (the last ones) left alone."""
     whole = np.eye(size)
     n = (size - N_CALIBRATION) // 3
     whole[: 3 * n, : 3 * n] = np.kron(np.eye(n), turn)

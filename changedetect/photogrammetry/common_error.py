@@ -1,8 +1,9 @@
 """
-Error that all points of a flight have alike: offset, tilt and horizontal shift, with their covariance.
+Error that all points of a flight have alike: offset, tilt, horizontal shift and bending, with their covariance.
 
 What a flight's poses leave in common does not average out over a region. Against the Earth it is as large as the
-offset of the GPS; between two flights adjusted together nearly all of it cancels.
+offset of the GPS; between two flights adjusted together nearly all of it cancels. Bending is what a lens that is not
+known well does to a block of near-vertical photos.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from changedetect.kernels.bundle import coordinate_modes
-from changedetect.photogrammetry.covariance import point_arrays
+from changedetect.photogrammetry.covariance import height_design, point_arrays
 from changedetect.typing import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -22,7 +23,9 @@ if TYPE_CHECKING:
 __all__ = ["COMMON_PARAMETERS", "CommonError", "PointModes", "common_error", "error_factor", "point_modes"]
 
 #: Parameters of the error, in the order of its covariance.
-COMMON_PARAMETERS = ("offset", "tilt_east", "tilt_north", "shift_east", "shift_north")
+COMMON_PARAMETERS = (
+    "offset", "tilt_east", "tilt_north", "shift_east", "shift_north", "bend_east", "bend_cross", "bend_north",
+)  # fmt: skip
 #: Points that the parameters are fitted to.
 _SAMPLE = 2_500
 #: Eigenvalues of the standardised covariance below this share of the largest are rounding.
@@ -32,16 +35,19 @@ _NEGLIGIBLE = 1e-12
 @dataclass(frozen=True)
 class CommonError:
     """
-    Height error z = offset + tilt_east * (east - e0) + tilt_north * (north - n0), and a horizontal shift.
+    Height error of a flight, and its horizontal shift.
+
+    With e = east - e0 and n = north - n0, z = offset + tilt_east e + tilt_north n + bend_east e^2 + bend_cross e n +
+    bend_north n^2.
 
     Attributes
     ----------
     centre : tuple of 2 float, m
         e0, n0 in ENU.
-    covariance : array, shape (5, 5)
-        In the order of `COMMON_PARAMETERS`; m, m per m, m.
+    covariance : array, shape (8, 8)
+        In the order of `COMMON_PARAMETERS`; m, m per m, m, m per m^2.
     residual_std : float, m
-        Root mean square, over the points, of the standard deviation of heights that is left after offset and tilt.
+        Root mean square, over the points, of the standard deviation of heights that is left after these.
     """
 
     centre: tuple[float, float]
@@ -83,7 +89,7 @@ def point_modes(adjustment: Adjustment, points: IntArray, factor: FloatArray) ->
     adjustment : Adjustment
     points : array of int
         Their numbers.
-    factor : array, shape (6 n_images + 5 n_lenses, n_modes)
+    factor : array, shape (6 n_images + 9 n_lenses, n_modes)
         From `error_factor` of the covariance of poses and lenses; the rows of these points' photos and lenses count.
     """
     spread = np.unique(np.linspace(0, points.size - 1, min(points.size, _SAMPLE)).astype(np.int64))
@@ -115,10 +121,9 @@ def common_error(later: PointModes, earlier: PointModes | None = None) -> Common
 
 
 def _fitted(modes: PointModes, middle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Parameters in each mode, shape (5, n_modes), and the variance of each height that they leave, m^2."""
-    east, north = (modes.place[:, :2] - middle).T
-    design = np.column_stack([np.ones(east.size), east, north])
-    plane = np.linalg.lstsq(design, modes.displacement[2], rcond=None)[0]
-    left = modes.displacement[2] - design @ plane
+    """Parameters in each mode, shape (8, n_modes), and the variance of each height that they leave, m^2."""
+    design = height_design(*(modes.place[:, :2] - middle).T)
+    fit = np.linalg.lstsq(design, modes.displacement[2], rcond=None)[0]
+    left = modes.displacement[2] - design @ fit
     shift = modes.displacement[:2].mean(axis=1)
-    return np.vstack([plane, shift]), np.asarray(np.sum(left**2, axis=1))
+    return np.vstack([fit[:3], shift, fit[3:]]), np.asarray(np.sum(left**2, axis=1))

@@ -20,9 +20,11 @@ from scipy.stats import chi2
 
 from changedetect.errors import InputDataError
 from changedetect.kernels.bundle import coordinate_modes, point_covariances, point_steps
+from changedetect.kernels.projection import N_CALIBRATION
 from changedetect.photogrammetry.adjustment import Adjustment
 from changedetect.photogrammetry.block import MARK, ImageBlock, Observations
 from changedetect.photogrammetry.covariance import point_arrays
+from changedetect.photogrammetry.lens import corrected_intrinsics
 from changedetect.typing import FloatArray, IntArray
 
 __all__ = ["ControlPoint", "ControlResult", "apply_control", "marked_observations"]
@@ -230,15 +232,12 @@ def _moved(adjustment: Adjustment, step: FloatArray, covariance: FloatArray) -> 
         adjustment.weight, 0.0, step,
     )  # fmt: skip
     pose = step[: 6 * n].reshape(n, 6)
-    lens = step[6 * n :].reshape(-1, 5)
-    intrinsics = old.intrinsics.copy()
-    intrinsics[:, :2] *= np.exp(lens[:, :1])
-    intrinsics[:, 2:6] += lens[:, 1:]
+    lens = step[6 * n :].reshape(-1, N_CALIBRATION)
     block = replace(
         old,
         rotation=Rotation.from_rotvec(pose[:, 3:]).as_matrix() @ old.rotation,
         position=old.position + pose[:, :3],
-        intrinsics=intrinsics,
+        intrinsics=corrected_intrinsics(old.intrinsics, lens),
     )
     return replace(
         adjustment,

@@ -10,6 +10,7 @@ the residuals, and the poses' covariance uses the number of independent observat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ __all__ = [
     "PointUncertainty",
     "SystematicError",
     "flight_difference",
+    "height_design",
     "pixel_correlation",
     "point_arrays",
     "point_uncertainty",
@@ -86,11 +88,14 @@ class SystematicError:
         Of offset (m), tilt east and tilt north (m per m).
     residual_std : float, m
         Root mean square, over the points, of the standard deviation that poses and lens leave after offset and tilt.
+    bend_std : array, shape (3,), m per m^2
+        Of the bending: coefficients of e^2, e n and n^2 in a surface fitted with offset and tilt.
     """
 
     centre: tuple[float, float]
     covariance: FloatArray
     residual_std: float
+    bend_std: FloatArray
 
     def describe(self) -> dict[str, Any]:
         """Content for a report."""
@@ -102,6 +107,7 @@ class SystematicError:
             "tilt_north_std_m_per_m": float(std[2]),
             "covariance": self.covariance.tolist(),
             "residual_std_m": self.residual_std,
+            "bend_std_m_per_m2": self.bend_std.tolist(),
         }
 
 
@@ -116,6 +122,8 @@ class PointUncertainty:
         Of the point's own pixels.
     sigma_shared : array, shape (n,), m
         Of poses and lens, after the flight's offset and tilt.
+    sigma_local : array, shape (n,), m
+        The same after its bending too.
     covariance : array, shape (n, 3, 3), m^2
         Whole covariance of the position in ENU, offset and tilt included.
     systematic : SystematicError
@@ -123,6 +131,7 @@ class PointUncertainty:
 
     sigma_own: FloatArray
     sigma_shared: FloatArray
+    sigma_local: FloatArray
     covariance: FloatArray
     systematic: SystematicError
 
@@ -205,9 +214,10 @@ def point_uncertainty(adjustment: Adjustment, points: IntArray) -> PointUncertai
     place = adjustment.points[points]
     modes = _modes(adjustment.camera_covariance)
     design, centre = _design(place)
-    plane, left = _plane_of_modes(adjustment, points, design, modes)
-    systematic = SystematicError(centre, plane @ plane.T, float(np.sqrt(np.mean(left))))
-    return PointUncertainty(np.sqrt(own[:, 2, 2]), np.sqrt(left), own + shared, systematic)
+    fits, left = _fits_of_modes(adjustment, points, design, modes)
+    systematic = _systematic(centre, fits, float(np.mean(left[0])))
+    after_plane, after_bend = np.sqrt(left)
+    return PointUncertainty(np.sqrt(own[:, 2, 2]), after_plane, after_bend, own + shared, systematic)
 
 
 def flight_difference(adjustment: Adjustment, earlier: IntArray, later: IntArray) -> SystematicError:
@@ -227,10 +237,15 @@ def flight_difference(adjustment: Adjustment, earlier: IntArray, later: IntArray
     """
     modes = _modes(adjustment.camera_covariance)
     design, centre = _design(np.concatenate([adjustment.points[earlier], adjustment.points[later]]))
-    first, left_first = _plane_of_modes(adjustment, earlier, design[: earlier.size], modes)
-    second, left_second = _plane_of_modes(adjustment, later, design[earlier.size :], modes)
-    plane = second - first
-    return SystematicError(centre, plane @ plane.T, float(np.sqrt(np.mean(left_first) + np.mean(left_second))))
+    first, left_first = _fits_of_modes(adjustment, earlier, design[: earlier.size], modes)
+    second, left_second = _fits_of_modes(adjustment, later, design[earlier.size :], modes)
+    fits = [b - a for a, b in zip(first, second, strict=True)]
+    return _systematic(centre, fits, float(np.mean(left_first[0]) + np.mean(left_second[0])))
+
+
+def height_design(east: FloatArray, north: FloatArray) -> FloatArray:
+    """Offset, tilt and bending of heights: columns 1, e, n, e^2, e n, n^2 of places about a middle, shape (n, 6)."""
+    return np.column_stack([np.ones(east.size), east, north, east**2, east * north, north**2])
 
 
 def point_arrays(adjustment: Adjustment, points: IntArray) -> tuple[Any, ...]:
@@ -257,27 +272,34 @@ def _modes(covariance: FloatArray) -> FloatArray:
 
 def _design(place: FloatArray) -> tuple[FloatArray, tuple[float, float]]:
     centre = (float(np.mean(place[:, 0])), float(np.mean(place[:, 1])))
-    return np.column_stack([np.ones(len(place)), place[:, 0] - centre[0], place[:, 1] - centre[1]]), centre
+    return height_design(place[:, 0] - centre[0], place[:, 1] - centre[1]), centre
 
 
-def _plane_of_modes(
+def _systematic(centre: tuple[float, float], fits: Sequence[FloatArray], variance: float) -> SystematicError:
+    plane, bent = fits
+    bend_std = np.sqrt(np.sum(bent[3:] ** 2, axis=1))
+    return SystematicError(centre, plane @ plane.T, float(np.sqrt(variance)), bend_std)
+
+
+def _fits_of_modes(
     adjustment: Adjustment, points: IntArray, design: FloatArray, modes: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[list[FloatArray], FloatArray]:
     """
-    Fit offset and tilt to every mode.
+    Fit offset and tilt, and these with bending, to every mode.
 
     Returns
     -------
-    plane : array, shape (3, n_modes)
-    left : array, shape (n,), m^2
-        Variance of each point's height that the planes do not explain.
+    fits : list of arrays, shape (3, n_modes) and (6, n_modes)
+    left : array, shape (2, n), m^2
+        Variance of each point's height that either does not explain.
     """
     spread = np.unique(np.linspace(0, points.size - 1, min(points.size, _SAMPLE_POINTS)).astype(np.int64))
     heights: Any = coordinate_modes
     sampled = heights(*point_arrays(adjustment, points[spread]), modes, 2)
-    plane = np.linalg.lstsq(design[spread], sampled, rcond=None)[0]
-    left = np.empty(points.size)
+    fits = [np.asarray(np.linalg.lstsq(design[spread, :k], sampled, rcond=None)[0]) for k in (3, 6)]
+    left = np.empty((2, points.size))
     for part in (slice(k, k + _CHUNK) for k in range(0, points.size, _CHUNK)):
-        rest = heights(*point_arrays(adjustment, points[part]), modes, 2) - design[part] @ plane
-        left[part] = np.sum(rest**2, axis=1)
-    return np.asarray(plane, dtype=np.float64), left
+        moves = heights(*point_arrays(adjustment, points[part]), modes, 2)
+        for row, fit in zip(left, fits, strict=True):
+            row[part] = np.sum((moves - design[part, : len(fit)] @ fit) ** 2, axis=1)
+    return fits, left

@@ -33,6 +33,8 @@ __all__ = [
 
 #: Newton steps of the undistortion; five reach 1e-10 for any lens whose image does not fold.
 _UNDISTORT_STEPS = 10
+#: Columns of the intrinsics that corrections 1 to 7 are added to: cx, cy, k1, k2, k3, p1, p2.
+_ADDED = (2, 3, 4, 5, 8, 6, 7)
 _COLMAP_PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
@@ -87,18 +89,20 @@ def corrected_intrinsics(intrinsics: FloatArray, correction: FloatArray) -> Floa
     Parameters
     ----------
     intrinsics : array, shape (n_lenses, 9)
-    correction : array, shape (n_lenses, 5)
-        Of log focal length, cx, cy (pixels), k1, k2.
+    correction : array, shape (n_lenses, 9)
+        Of log focal length, cx, cy (pixels), k1, k2, k3, p1, p2, log fx / fy.
     """
     moved: FloatArray = intrinsics.copy()
-    moved[:, :2] *= np.exp(correction[:, :1])
-    moved[:, 2:6] += correction[:, 1:]
+    moved[:, :2] *= np.exp(correction[:, :1] + correction[:, 8:] * np.array([0.5, -0.5]))
+    moved[:, _ADDED] += correction[:, 1:8]
     return moved
 
 
 def intrinsics_correction(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Corrections that take intrinsics to others, shape (n_lenses, 5); the inverse of `corrected_intrinsics`."""
-    return np.column_stack([np.log(after[:, 0] / before[:, 0]), after[:, 2:6] - before[:, 2:6]])
+    """Corrections that take intrinsics to others, shape (n_lenses, 9); the inverse of `corrected_intrinsics`."""
+    scale = np.log(after[:, :2] / before[:, :2])
+    added = after[:, _ADDED] - before[:, _ADDED]
+    return np.column_stack([scale.mean(axis=1), added, scale[:, 0] - scale[:, 1]])
 
 
 def with_calibration(camera: CameraIntrinsics, correction: FloatArray) -> CameraIntrinsics:
@@ -108,19 +112,12 @@ def with_calibration(camera: CameraIntrinsics, correction: FloatArray) -> Camera
     Parameters
     ----------
     camera : CameraIntrinsics
-    correction : array, shape (5,)
-        Of log focal length, cx, cy (pixels), k1, k2.
+    correction : array, shape (9,)
+        As of `corrected_intrinsics`.
     """
-    scale = float(np.exp(correction[0]))
-    return replace(
-        camera,
-        fx=camera.fx * scale,
-        fy=camera.fy * scale,
-        cx=camera.cx + float(correction[1]),
-        cy=camera.cy + float(correction[2]),
-        k1=camera.k1 + float(correction[3]),
-        k2=camera.k2 + float(correction[4]),
-    )
+    moved = corrected_intrinsics(intrinsics_array(camera)[None], np.asarray(correction)[None])[0]
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(value) for value in moved)
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
 
 
 def reduced_camera(camera: CameraIntrinsics, factor: int) -> CameraIntrinsics:

@@ -93,6 +93,7 @@ def triangulated(
         weight=kept.sigma**-2.0,
         origin=origin,
         camera_covariance=covariance,
+        lens_slope=np.zeros((size, size - n)),
         lens_correction=lenses,
         lens_std=lenses,
         boresight=np.zeros((n_flights, 3)),

@@ -155,8 +155,9 @@ def common_terms(errors: Sequence[EpochError], elevation: FloatArray, grid: Grid
             design = content.offset_design(easting, northing, slope_east, slope_north, height)  # type: ignore[union-attr]
         else:
             centre = content.centre  # type: ignore[union-attr]
-            flat = [np.ones(easting.size), easting - centre[0], northing - centre[1]]
-            design = np.column_stack([*flat, -slope_east, -slope_north])
+            east, north = easting - centre[0], northing - centre[1]
+            columns = [np.ones(east.size), east, north, -slope_east, -slope_north, east**2, east * north, north**2]
+            design = np.column_stack(columns[: len(content.covariance)])
         terms.append(CoherentTerm(design, error.factor * np.asarray(content.covariance, dtype=np.float64)))
     return terms
 

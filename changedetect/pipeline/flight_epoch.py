@@ -130,7 +130,7 @@ def reconstruct_epoch(
     error = common_error(point_modes(finished.adjustment, everything, factor))
     options = ReconstructOptions(dense=config.flights.dense)
     with atomic_directory(programme.flight_directory(epoch.epoch_id) / POINTS_FOLDER) as folder:
-        points, described = write_flight(run, folder / POINTS_FILE, part, config.crs, options)
+        points, described = write_flight(run, folder / POINTS_FILE, part, config.crs, options, has_bend_apart=True)
         described["file"] = POINTS_FILE
         save_finished(folder / _ORIENTATION_FILE, finished)
         records = _anchor_records(programme, anchor_ids, anchored, run.origin)

@@ -22,7 +22,7 @@ from changedetect.navigation.frame import LocalFrame
 from changedetect.navigation.photos import camera_poses
 from changedetect.navigation.poses import CameraPoses
 from changedetect.navigation.solution import NavigationSolution, navigate
-from changedetect.photogrammetry.adjustment import LENS_PARAMETERS, Adjustment
+from changedetect.photogrammetry.adjustment import Adjustment
 from changedetect.photogrammetry.block import ImageBlock, Observations
 from changedetect.photogrammetry.calibration import observable_parameters
 from changedetect.photogrammetry.control import ControlPoint, ControlResult, apply_control, marked_observations
@@ -54,6 +54,8 @@ _CAUSAL_CORRELATION_TIME = 4.0
 _MARK_STD = 0.5
 #: Lens parameters are adjusted that the photos know at least five times better than EXIF.
 _MAX_SHARE = 0.2
+#: Of a lens known from EXIF, adjusted where the photos determine them.
+_PHOTO_LENS = ("focal", "cx", "cy", "k1", "k2")
 #: How well features are predicted after a rough orientation, pixels.
 _ROUGH_PIXELS = 3.0
 
@@ -75,7 +77,7 @@ class FlightSource:
         Of poses without cross-covariance.
     navigation : dict
         For the report.
-    lens_std : tuple of 5 float, optional
+    lens_std : tuple of 9 float, optional
         How well the lens is known, as `AdjustmentSettings.lens_std`; it is then always estimated. None: it is exact.
     has_heading : array, shape (n,), bool, optional
         Given for poses too rough to predict features from: which of them state a heading.
@@ -97,7 +99,7 @@ class FlightSource:
     paths: tuple[Path, ...]
     correlation_time: float
     navigation: dict[str, Any]
-    lens_std: tuple[float, float, float, float, float] | None = None
+    lens_std: tuple[float, ...] | None = None
     has_heading: BoolArray | None = None
     is_known: bool = False
     reduction: int = 1
@@ -384,7 +386,7 @@ def _photo_settings(settings: OrientationSettings, source: FlightSource) -> Orie
     """Settings for photos without logs: a rough lens is adjusted, and features are sought in flat pictures too."""
     adjustment = settings.adjustment
     if source.lens_std is not None:
-        adjustment = replace(adjustment, lens=LENS_PARAMETERS, lens_std=source.lens_std, max_share=_MAX_SHARE)
+        adjustment = replace(adjustment, lens=_PHOTO_LENS, lens_std=source.lens_std, max_share=_MAX_SHARE)
     ties = TieSettings(n_features=6000, contrast=0.01) if settings.ties == TieSettings() else settings.ties
     return replace(settings, adjustment=adjustment, ties=ties)
 

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from changedetect.errors import ModelStateError
+from changedetect.kernels.projection import N_CALIBRATION
 from changedetect.navigation.frame import LocalFrame
 from changedetect.photogrammetry.adjustment import Adjustment
 from changedetect.photogrammetry.anchored import FinishedFlight
@@ -36,8 +37,8 @@ logger = logging.getLogger(__name__)
 #: Changes when a step computes something else from the same input.
 _FORMAT = 2
 _ADJUSTMENT_ARRAYS = (
-    "points", "weight", "origin", "camera_covariance", "lens_correction", "lens_std", "boresight", "boresight_std",
-    "pose_correction",
+    "points", "weight", "origin", "camera_covariance", "lens_slope", "lens_correction", "lens_std", "boresight",
+    "boresight_std", "pose_correction",
 )  # fmt: skip
 
 
@@ -211,11 +212,37 @@ def load_finished(path: Path) -> FinishedFlight:
         poses = found["rotation"], found["position"], found["intrinsics"]
         given = ImageBlock(names, *poses, found["size"], found["lens"], found["flight"])
         latitude, longitude, height = (float(v) for v in found["origin"])
+        found = _with_all_lens_parameters(found)
         cross = {str(name): found[f"cross_{k}"] for k, name in enumerate(found["bound_to"])}
         return FinishedFlight(_adjustment_from(found, given), LocalFrame(latitude, longitude, height), cross)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         msg = f"'{path}' cannot be read ({error}). `changedetect update` makes it anew once the folder is removed."
         raise ModelStateError(msg) from error
+
+
+def _with_all_lens_parameters(found: Mapping[str, np.ndarray[Any, Any]]) -> dict[str, np.ndarray[Any, Any]]:
+    """
+    Arrays of a flight as versions wrote it that knew five lens parameters: the others are exact.
+
+    Rows of poses and lenses are found by their number; the lens comes last, and there is one in flights with others.
+    """
+    out = dict(found)
+    n_lenses = len(found["intrinsics"])
+    n = 6 * len(found["names"])
+    before = (len(found["camera_covariance"]) - n) // n_lenses
+    if before == N_CALIBRATION and "lens_slope" in found:
+        return out
+    rows = np.concatenate([np.arange(n), *(n + N_CALIBRATION * k + np.arange(before) for k in range(n_lenses))])
+    size = n + N_CALIBRATION * n_lenses
+    out["camera_covariance"] = np.zeros((size, size))
+    out["camera_covariance"][np.ix_(rows, rows)] = found["camera_covariance"]
+    out["lens_slope"] = np.zeros((size, size - n))
+    for name in ("lens_correction", "lens_std"):
+        out[name] = np.pad(found[name], ((0, 0), (0, N_CALIBRATION - before)))
+    for k in range(len(found["bound_to"])):
+        missing = N_CALIBRATION - before
+        out[f"cross_{k}"] = np.pad(found[f"cross_{k}"], ((0, missing), (0, missing)))
+    return out
 
 
 def _adjustment_arrays(a: Adjustment) -> dict[str, np.ndarray[Any, Any]]:

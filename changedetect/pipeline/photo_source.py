@@ -69,7 +69,7 @@ def read_photo_source(directory: Path, *, camera_file: Path | None = None) -> Fl
     reduction = _reduction(found.camera)
     lens_std = found.lens_std
     if lens_std is not None:
-        lens_std = (lens_std[0], lens_std[1] / reduction, lens_std[2] / reduction, lens_std[3], lens_std[4])
+        lens_std = (lens_std[0], lens_std[1] / reduction, lens_std[2] / reduction, *lens_std[3:])
     return FlightSource(
         label=str(directory),
         poses=found.poses,

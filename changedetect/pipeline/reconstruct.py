@@ -223,7 +223,13 @@ def reconstruct(
 
 
 def write_flight(
-    run: FlightRun, file: Path, part: FlightPart, crs: str, options: ReconstructOptions
+    run: FlightRun,
+    file: Path,
+    part: FlightPart,
+    crs: str,
+    options: ReconstructOptions,
+    *,
+    has_bend_apart: bool = False,
 ) -> tuple[FlightPoints, JSONObject]:
     """
     Write the points of an adjusted flight.
@@ -238,6 +244,8 @@ def write_flight(
         Of the points.
     options : ReconstructOptions
         `dense` counts.
+    has_bend_apart : bool
+        The flight's bending is accounted for elsewhere (`CommonError`); standard deviations of points leave it out.
 
     Returns
     -------
@@ -245,7 +253,7 @@ def write_flight(
     described : dict
         For a report.
     """
-    points = _points(run, part, crs, options)
+    points = _points(run, part, crs, is_dense=options.dense, has_bend_apart=has_bend_apart)
     file.parent.mkdir(parents=True, exist_ok=True)
     extra = {"n_views": (points.n_views.astype(np.uint8), "photos the point was seen in")}
     write_points(file, points.cloud, crs, extra=extra)
@@ -382,16 +390,17 @@ def _oriented(runs: list[FlightRun], options: ReconstructOptions) -> tuple[Orien
     return together, [FlightPart(together.adjustment, points, k) for k, points in enumerate(together.points)]
 
 
-def _points(run: FlightRun, part: FlightPart, crs: str, options: ReconstructOptions) -> FlightPoints:
+def _points(run: FlightRun, part: FlightPart, crs: str, *, is_dense: bool, has_bend_apart: bool) -> FlightPoints:
     """Points of a flight in the CRS, those of the adjustment or one for every cell of a fine grid."""
     adjustment, chosen = part.adjustment, part.points
     uncertainty = point_uncertainty(adjustment, chosen)
-    places, sigma = adjustment.points[chosen], uncertainty.sigma
+    shared = uncertainty.sigma_local if has_bend_apart else uncertainty.sigma_shared
+    places, sigma = adjustment.points[chosen], np.hypot(uncertainty.sigma_own, shared)
     n_views = adjustment.observations.n_views[chosen]
-    if options.dense:
+    if is_dense:
         found = _dense(run, part)
         places, n_views = found.points, found.n_views
-        sigma = np.hypot(found.sigma, uncertainty.sigma_shared[found.nearest])
+        sigma = np.hypot(found.sigma, shared[found.nearest])
     geodetic = run.origin.to_geodetic(places)
     transform = make_transform(_GEODETIC, crs)
     easting, northing, elevation = transform(geodetic[:, 1], geodetic[:, 0], geodetic[:, 2])

@@ -6,10 +6,14 @@ ties found for the smoothed poses), and a point for every cell of a fine grid on
 together and differenced, point against local plane. NMAD of heights on open ground after removing offset and tilt;
 `+shift` removes a horizontal shift too (the GPS is a metre or two off, and ground slopes).
 
+`--simulated` does the same as `--programme` with small flights of the package's own simulator, with the lens stated
+right and wrong.
+
 `--pycolmap` runs pycolmap (pip install pycolmap) on the first epoch beside the front-end, both from nothing, with the
 same number of threads; `--programme` takes both flights through `init`, `add`, `add`, `update` and judges the maps.
 
 Run: CHANGEDETECT_DATA=DIR python tests/benchmarks/flights.py [--work DIR] [--workers 2] [--pycolmap] [--programme]
+[--simulated]
 """
 
 import argparse
@@ -25,11 +29,15 @@ from pathlib import Path
 import laspy
 import numpy as np
 import rasterio
+import yaml
 from scipy.ndimage import map_coordinates, maximum_filter
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import small_flights
 
 from changedetect.cli import main as changedetect_main
 from changedetect.crs import make_transform
@@ -38,12 +46,15 @@ from changedetect.io.cog import read_cog
 from changedetect.navigation.frame import LocalFrame
 from changedetect.pipeline.flight_store import load_finished
 from changedetect.pipeline.reconstruct import ReconstructOptions, reconstruct
+from changedetect.synthetic.flight_photos import FlightDesign
 
 DATA = Path(os.environ.get("CHANGEDETECT_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")) / "flight_sim"
 CRS = "EPSG:32756+4979"
 ORIGIN = LocalFrame(-33.89, 151.19, 40.0)
 #: Photographed by both strips, m from the origin.
 EAST, NORTH = 88.0, 36.0
+#: Of k1 and p1 of either flight of a simulated programme: the lens as it is, another lens, the same wrong one.
+_LENS_ERRORS = (((0.0, 0.0), (0.0, 0.0)), ((0.0, 0.0), (0.01, 0.0005)), ((0.01, 0.0005), (0.01, 0.0005)))
 
 
 def nmad(values):
@@ -236,6 +247,40 @@ def through_the_programme(folder, joint):
         print(f"  {change['kind']:8s} mean {found:+.3f} m  truth {true:+.3f} m  cells flagged {share:.0f} %")
 
 
+def simulated(folder, seed, size, n_photos, errors):
+    """
+    Print how the change map of two simulated flights compares with the truth.
+
+    `errors` are added to k1 and p1 of the lens stated for the first and for the second flight.
+    """
+    site = folder / f"small_{seed}_{errors}".replace(" ", "")
+    epochs = small_flights.FIRST, small_flights.SECOND
+    flights = small_flights.fly(
+        site / "flights", seed=seed, design=FlightDesign(n_strips=2, n_photos=n_photos, size=size)
+    )
+    _run(["init", site / "site", "--crs", CRS, "--resolution", "0.5"])
+    for k, (epoch, error) in enumerate(zip(epochs, errors, strict=True), start=1):
+        file = flights / f"epoch{k}" / "camera.yaml"
+        camera = yaml.safe_load(file.read_text())
+        lens = camera["distortion_coefficients"]["data"]
+        lens[0], lens[2] = lens[0] + error[0], lens[2] + error[1]
+        file.write_text(yaml.safe_dump(camera))
+        _run(["add", site / "site", epoch, flights / f"epoch{k}"])
+    _run(["update", site / "site"])
+    truth = small_flights.TrueChange(site / "site", flights / "truth", epochs)
+    error = truth.dod - truth.change
+    covered = np.mean(np.abs(error[truth.is_open]) < truth.lod[truth.is_open])
+    flagged = np.isin(truth.change_class[truth.is_stable], (1, 2)).mean()
+    patches = "  ".join("{} {:+.3f} ({:+.3f})".format(kind, *truth.means(kind)) for kind in ("mound", "pit", "plateau"))
+    print(
+        f"seed {seed}, 2 x {n_photos} photos, k1 and p1 off by {errors}: NMAD {nmad(error[truth.is_stable]):.3f} m, "
+        f"median {np.median(error[truth.is_stable]):+.3f} m, 95 % interval covers {100 * covered:.1f} %, flagged "
+        f"{100 * flagged:.1f} %; {patches}",
+        flush=True,
+    )
+    return site, truth
+
+
 def _run(arguments):
     """Run the command line; stop where it fails."""
     code = changedetect_main([*map(str, arguments), "--quiet"])
@@ -294,6 +339,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="keep results here")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--pycolmap", action="store_true", help="run pycolmap beside the front-end, nothing else")
+    parser.add_argument("--simulated", action="store_true", help="judge programmes of small flights, nothing else")
     parser.add_argument("--programme", action="store_true", help="judge the maps of a programme, nothing else")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -304,7 +350,11 @@ def main() -> None:
         if arguments.programme:
             for joint in ("auto", "never"):
                 through_the_programme(folder, joint)
-        if arguments.pycolmap or arguments.programme:
+        if arguments.simulated:
+            for errors in _LENS_ERRORS:
+                for seed in (1, 2, 4):
+                    simulated(folder, seed, (512, 384), 6, errors)
+        if arguments.pycolmap or arguments.programme or arguments.simulated:
             return
         print("epoch  method    points/m2      NMAD    +shift  (east, north)    sigma  sd(z)  95 %       s  cpu s")
         for epoch in (1, 2):

@@ -86,7 +86,8 @@ def test_metashape_skew_is_refused():
 
 
 def test_calibration_corrections_scale_both_focal_lengths():
-    moved = with_calibration(WIDE, np.array([0.01, 1.0, -2.0, 0.001, 0.002]))
-    assert_allclose(moved.fx / WIDE.fx, np.exp(0.01), rtol=1e-12, atol=0)
-    assert_allclose(moved.fy / WIDE.fy, np.exp(0.01), rtol=1e-12, atol=0)
-    assert_allclose([moved.cx, moved.cy, moved.k1], [2012.0, 1488.0, -0.209], rtol=1e-12, atol=0)
+    moved = with_calibration(WIDE, np.array([0.01, 1.0, -2.0, 0.001, 0.002, 0.003, 0.0001, -0.0002, 0.004]))
+    assert_allclose(moved.fx / WIDE.fx, np.exp(0.012), rtol=1e-12, atol=0)
+    assert_allclose(moved.fy / WIDE.fy, np.exp(0.008), rtol=1e-12, atol=0)
+    assert_allclose([moved.cx, moved.cy, moved.k1, moved.k2], [2012.0, 1488.0, -0.209, 0.062], rtol=1e-12, atol=0)
+    assert_allclose([moved.p1, moved.p2, moved.k3], [0.0008, -0.0013, -0.005], rtol=1e-12, atol=0)

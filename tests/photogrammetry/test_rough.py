@@ -11,7 +11,7 @@ from photogrammetry import rendered
 from scipy.spatial.transform import Rotation
 
 from changedetect.errors import InputDataError
-from changedetect.photogrammetry.adjustment import LENS_PARAMETERS, AdjustmentSettings, adjust
+from changedetect.photogrammetry.adjustment import AdjustmentSettings, adjust
 from changedetect.photogrammetry.block import ImageBlock
 from changedetect.photogrammetry.covariance import point_uncertainty
 from changedetect.photogrammetry.headings import Headings, correct_headings, estimate_headings
@@ -23,8 +23,8 @@ from changedetect.photogrammetry.ties import Features, PairMatches, TieSettings,
 from changedetect.photogrammetry.triangulation import are_determined, residuals, triangulate
 
 STD = np.array([1.5, 1.5, 0.5, *np.radians([2.0, 2.0, 8.0])])
-LENS_STD = (0.05, 5.0, 5.0, 0.1, 0.1)
-LENS = AdjustmentSettings(lens=LENS_PARAMETERS, lens_std=LENS_STD, max_share=0.2)
+LENS_STD = (0.05, 5.0, 5.0, 0.1, 0.1, 0.1, 0.002, 0.002, 0.002)
+LENS = AdjustmentSettings(lens=("focal", "cx", "cy", "k1", "k2"), lens_std=LENS_STD, max_share=0.2)
 
 
 def heading(rotation):
