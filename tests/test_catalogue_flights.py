@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -230,3 +231,8 @@ def test_the_design_of_a_common_error_is_offset_tilt_and_shift_on_the_slope():
     np.testing.assert_allclose(term.design[:, 2], northing - 2.0, rtol=0, atol=1e-9)
     np.testing.assert_allclose(term.design[:, 3], -0.1, rtol=0, atol=1e-9)
     np.testing.assert_allclose(term.design[:, 4], 0.3, rtol=0, atol=1e-9)
+    assert term.design.shape[1] == 5  # a record without bending, as earlier versions wrote it
+    bent = replace(ERROR, covariance=tuple(tuple(row) for row in np.eye(8).tolist()))
+    (term,) = common_errors.common_terms((common_errors.EpochError(("flight", "a"), bent),), elevation, grid)
+    east, north = easting - 1.0, northing - 2.0
+    np.testing.assert_allclose(term.design[:, 5:].T, [east**2, east * north, north**2], rtol=1e-12, atol=0)

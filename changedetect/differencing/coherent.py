@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from changedetect.typing import FloatArray
+    from collections.abc import Sequence
 
-__all__ = ["CoherentTerm"]
+    from changedetect.typing import BoolArray, FloatArray
+
+__all__ = ["CoherentTerm", "likely_errors"]
 
 
 @dataclass(frozen=True)
@@ -126,3 +128,36 @@ class CoherentTerm:
         """
         gradient = self._gradient(weights)
         return float(gradient @ self.covariance @ gradient)
+
+
+def likely_errors(
+    difference: FloatArray, errors: Sequence[FloatArray], ground: BoolArray, n_independent: float
+) -> FloatArray:
+    """
+    What coherent errors most likely contribute to a difference.
+
+    Parameters
+    ----------
+    difference : array, shape (n_rows, n_cols), m
+    errors : sequence of array, shape (n_rows, n_cols), m
+        Independent errors, each for one standard deviation (`CoherentTerm.independent_errors`).
+    ground : array, shape (n_rows, n_cols), bool
+        Unchanged, and known.
+    n_independent : float
+        How many independent values the ground holds: its cells err together.
+
+    Returns
+    -------
+    contribution : array, shape (n_rows, n_cols), m
+
+    Notes
+    -----
+    Posterior mean of their sizes, each normal with variance one before, given differences of equal variance of which
+    as many count as are independent. On ground that knows nothing of them the contribution is nought.
+    """
+    columns = np.column_stack([error[ground] for error in errors])
+    values = difference[ground]
+    weight = n_independent / max(float(np.sum(values**2)), 1e-300)  # n_independent / n over the mean square
+    normal = weight * columns.T @ columns + np.eye(columns.shape[1])
+    size = np.linalg.solve(normal, weight * columns.T @ values)
+    return np.asarray(sum(k * error for k, error in zip(size, errors, strict=True)))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from changedetect.differencing.coherent import likely_errors
 from changedetect.differencing.covariates import error_covariates
 from changedetect.differencing.error_model import estimate_errors
 from changedetect.differencing.error_scale import half_width_scale
@@ -37,6 +38,8 @@ _GAUSSIAN_WIDTH = math.sqrt(8.0 * math.log(2.0))
 #: The majority of the cells lies this many times its own scatter away from zero: the epochs are not aligned, and their
 #: offset is no measure of their errors.
 _OFFSET_RATIO = 1.5
+#: Coherent errors below this share of the squared difference add nothing to what its scatter shows.
+_COHERENT_SHARE = 0.02
 #: Range of the Gaussian correlation whose integral is that of estimates with a side of shared data of one:
 #: 2 pi range^2 = side^2.
 _RANGE_OF_SIDE = 1.0 / math.sqrt(2.0 * math.pi)
@@ -139,6 +142,12 @@ def cell_errors(
     shared = np.zeros(shape)
     for term in coherent:
         shared += term.variance((shape[0], shape[1]))
+    unchanged = ground & known
+    if model.is_correlated and np.mean(shared[unchanged]) > _COHERENT_SHARE * np.mean(difference[unchanged] ** 2):
+        # Else the coherent errors of this difference would count twice, once among those that its scatter shows
+        columns = [column for term in coherent for column in term.independent_errors((shape[0], shape[1]))]
+        less = difference - likely_errors(difference, columns, unchanged, model.n_independent)
+        model, ground = estimate_errors(less, variance, covariates, resolution, local_range, stable)
     correlated = model.correlated_variance(covariates, (shape[0], shape[1]))
     errors = CellErrors(model, correlated, shared, tuple(coherent), ground)
     if not predict or not model.is_correlated:

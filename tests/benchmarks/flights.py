@@ -270,11 +270,14 @@ def simulated(folder, seed, size, n_photos, errors):
     truth = small_flights.TrueChange(site / "site", flights / "truth", epochs)
     error = truth.dod - truth.change
     covered = np.mean(np.abs(error[truth.is_open]) < truth.lod[truth.is_open])
+    everywhere = np.isfinite(error)
+    covered_all = np.mean(np.abs(error[everywhere]) < truth.lod[everywhere])
     flagged = np.isin(truth.change_class[truth.is_stable], (1, 2)).mean()
     patches = "  ".join("{} {:+.3f} ({:+.3f})".format(kind, *truth.means(kind)) for kind in ("mound", "pit", "plateau"))
     print(
         f"seed {seed}, 2 x {n_photos} photos, k1 and p1 off by {errors}: NMAD {nmad(error[truth.is_stable]):.3f} m, "
-        f"median {np.median(error[truth.is_stable]):+.3f} m, 95 % interval covers {100 * covered:.1f} %, flagged "
+        f"median {np.median(error[truth.is_stable]):+.3f} m, 95 % interval covers {100 * covered:.1f} % of open "
+        f"ground seen four times, {100 * covered_all:.1f} % of all cells, flagged "
         f"{100 * flagged:.1f} %; {patches}",
         flush=True,
     )

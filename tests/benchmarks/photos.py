@@ -5,7 +5,9 @@ Seneca (fixed wing, 40 photos).
 Points are moved onto the reference by a similarity (robust point-to-plane ICP); then heights are compared with the
 median of the reference's points within 0.25 m. Both programs estimate the lens from near-vertical photos, which leaves
 a bending of the ground nearly free: what remains after a quadratic surface is given too, and how far the camera heights
-of either bend against the barometer's.
+of either bend against the barometer's. Coverage is that of 95 % intervals by sigma_z, and with the reference's own
+bending in the budget too: its standard error is that of the same photos adjusted as the reference was, positions good
+to 10 m, no angles, every lens parameter free.
 
 Run: CHANGEDETECT_DATA=DIR python tests/benchmarks/photos.py [--work DIR] [--workers 2] [--dense]
 """
@@ -29,12 +31,20 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from changedetect.crs import make_transform
 from changedetect.navigation.poses import CameraPoses
+from changedetect.photogrammetry.adjustment import LENS_PARAMETERS, adjust
 from changedetect.photogrammetry.block import ImageBlock
-from changedetect.pipeline.flight_run import read_flight_source
-from changedetect.pipeline.reconstruct import ReconstructOptions, reconstruct
+from changedetect.photogrammetry.common_error import common_error, error_factor, point_modes
+from changedetect.photogrammetry.covariance import point_uncertainty
+from changedetect.photogrammetry.orientation import OrientationSettings
+from changedetect.photogrammetry.priors import pose_information
+from changedetect.pipeline.flight_run import FlightRun, read_flight_source
+from changedetect.pipeline.flight_store import FlightStore
+from changedetect.pipeline.reconstruct import ReconstructOptions, output_crs, reconstruct
 
 DATA = Path(os.environ.get("CHANGEDETECT_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 _RADIUS = 0.25
+#: Prior of a lens of which nothing is known: focal length, cx, cy, k1, k2, k3, p1, p2, aspect.
+_LOOSE_LENS = (0.3, 50.0, 50.0, 0.3, 0.3, 0.3, 0.01, 0.01, 0.01)
 _SAMPLE = 60_000
 
 
@@ -46,6 +56,11 @@ class Judged:
     nmad: float
     p95: float
     bent: float
+    covered: float
+    covered_with_reference: float
+    left_covered: float
+    bend: np.ndarray
+    bend_distance: float
 
 
 def nmad(values):
@@ -54,9 +69,10 @@ def nmad(values):
 
 
 def read_points(path):
-    """Coordinates of a LAS file, shape (n, 3)."""
+    """Coordinates of a LAS file and sigma_z where it has one, shape (n, 4)."""
     cloud = laspy.read(path)
-    points = np.column_stack([cloud.x, cloud.y, cloud.z])
+    sigma = cloud["sigma_z"] if "sigma_z" in cloud.point_format.dimension_names else np.zeros(len(cloud.x))
+    points = np.column_stack([cloud.x, cloud.y, cloud.z, sigma])
     if len(points) > _SAMPLE:
         points = points[np.random.default_rng(0).choice(len(points), _SAMPLE, replace=False)]
     return points
@@ -86,11 +102,15 @@ def moved_onto(points, reference, steps=40):
     return moved
 
 
-def compare(path, reference_path):
-    """Heights of a cloud against a reference, after a similarity and after a quadratic surface too."""
+def compare(points, reference_path, bending, reference_bending):
+    """
+    Heights of points (east, north, up, sigma) against a reference, after a similarity and a quadratic surface too.
+
+    `bending` and `reference_bending`, 3 x 3, are the covariances of either's bending: of e^2, e n, n^2.
+    """
     reference = laspy.read(reference_path)
     reference = np.column_stack([reference.x, reference.y, reference.z])
-    moved = moved_onto(read_points(path), reference)
+    moved, sigma = moved_onto(points[:, :3], reference), points[:, 3]
     near = cKDTree(reference[:, :2]).query_ball_point(moved[:, :2], _RADIUS)
     height = np.array([np.median(reference[k, 2]) if len(k) >= 3 else np.nan for k in near])
     good = np.isfinite(height)
@@ -102,7 +122,44 @@ def compare(path, reference_path):
         fit = np.linalg.lstsq(design * weight[:, None], error * weight, rcond=None)[0]
         left = error - design @ fit
         weight = 1 / (1 + (left / (2 * nmad(left))) ** 2)
-    return Judged(int(good.sum()), nmad(error), float(np.percentile(np.abs(error - np.median(error)), 95)), nmad(left))
+    away = np.abs(error - np.median(error))
+    bent = design[:, 3:] - design[:, :3] @ np.linalg.lstsq(design[:, :3], design[:, 3:], rcond=None)[0]
+    both = np.sqrt(sigma[good] ** 2 + np.einsum("ni,ij,nj->n", bent, reference_bending, bent))
+    alone = np.sqrt(np.maximum(sigma[good] ** 2 - np.einsum("ni,ij,nj->n", bent, bending, bent), 0.02**2))
+    return Judged(
+        int(good.sum()),
+        nmad(error),
+        float(np.percentile(away, 95)),
+        nmad(left),
+        float(np.mean(away < 1.96 * sigma[good])),
+        float(np.mean(away < 1.96 * both)),
+        float(np.mean(np.abs(left - np.median(left)) < 1.96 * alone)),
+        1e3 * fit[3:],
+        float(fit[3:] @ np.linalg.solve(bending + reference_bending, fit[3:])),
+    )
+
+
+def as_the_reference(folder, work, workers):
+    """Points of the same photos adjusted with hardly any priors, shape (n, 4); covariances of bending, theirs and ours."""
+    source = read_flight_source(folder)
+    run = FlightRun(source, FlightStore(work), OrientationSettings(workers=workers), source.poses.origin)
+    n = len(source.poses)
+    loose = np.tile(np.diag([10.0**2] * 3 + [np.radians(20.0) ** 2] * 3), (n, 1, 1))
+    information = pose_information(replace(source.poses, covariance=loose), correlation_time=0.0)
+    settings = replace(
+        run.settings.adjustment, lens=LENS_PARAMETERS[:8], lens_std=_LOOSE_LENS, max_share=1.0, min_views=3
+    )
+    oriented = run.oriented
+    solved = adjust(run.block, oriented.observations, information, settings, start=oriented.adjustment.block)
+    everything = np.arange(len(solved.points))
+    error = common_error(point_modes(solved, everything, error_factor(solved.camera_covariance)))
+    geodetic = run.origin.to_geodetic(solved.points)
+    crs = output_crs(folder, run.origin, None)
+    places = make_transform("EPSG:4979", crs)(geodetic[:, 1], geodetic[:, 0], geodetic[:, 2])
+    points = np.column_stack([*places, point_uncertainty(solved, everything).sigma])
+    own = oriented.adjustment
+    ours = common_error(point_modes(own, np.arange(len(own.points)), error_factor(own.camera_covariance)))
+    return points, error.covariance[5:, 5:], ours.covariance[5:, 5:], float(solved.block.intrinsics[0, 0])
 
 
 def bend_of_cameras(folder, work):
@@ -184,12 +241,25 @@ def run(name, folder, workers, *, dense, cell):
     draw(DATA / name, output, work, output.with_suffix(".png"), cell)
     reference = DATA / name / "model.laz"
     if reference.is_file():
-        judged = compare(output, reference)
+        loose, theirs, ours, focal = as_the_reference(DATA / name, work, workers)
+        judged = compare(read_points(output), reference, ours, theirs)
+        alike = compare(loose, reference, theirs, theirs)
         curvature, left = bend_of_cameras(DATA / name, work)
         print(
             f"  against {reference.name}: n {judged.n:,}, NMAD {judged.nmad:.3f} m, 95 % {judged.p95:.3f} m; without a "
             f"quadratic surface {judged.bent:.3f} m; camera heights bend {curvature:+.2f} mm/m2 against the barometer, "
             f"left {left:.3f} m"
+        )
+        print(
+            f"  95 % intervals by sigma_z cover {100 * judged.covered:.1f} %, with the reference's bending "
+            f"{100 * judged.covered_with_reference:.1f} %, of what a quadratic surface leaves "
+            f"{100 * judged.left_covered:.1f} %; the difference bends by {judged.bend.round(2)} mm/m2, standard errors "
+            f"{(1e3 * np.sqrt(np.diag(ours))).round(2)} and {(1e3 * np.sqrt(np.diag(theirs))).round(2)} (reference), "
+            f"chi-square of the bend {judged.bend_distance:.1f} (3 degrees of freedom)"
+        )
+        print(
+            f"  adjusted as the reference was: NMAD {alike.nmad:.3f} m, bend {alike.bend.round(2)} mm/m2, focal length "
+            f"{focal:.0f} px"
         )
 
 

@@ -108,3 +108,20 @@ def test_what_alignment_leaves_uncertain_widens_every_cell():
 def test_stable_ground_of_another_shape_is_refused():
     with pytest.raises(ValueError, match=r"stable ground has shape \(3, 3\), the grid \(60, 60\)"):
         difference_models(epoch(1), epoch(2), GRID, SETTINGS, stable=np.ones((3, 3), bool))
+
+
+def test_coherent_errors_are_not_counted_among_those_that_scatter_too():
+    from error_fields import evidence, quiet
+
+    from changedetect.differencing.pair import cell_errors
+
+    shape = (100, 100)
+    east = np.tile(np.linspace(-1.0, 1.0, shape[1]), shape[0])
+    tilt = CoherentTerm(east[:, None], np.array([[0.05**2]]))
+    known, likely = [], []
+    for seed in range(4):
+        d = quiet(seed, shape, local=0.005, correlated=0.03, length=3.0)
+        tilted = evidence(d + 0.08 * east.reshape(shape), 0.005)
+        known.append(np.sqrt(cell_errors(evidence(d, 0.005), 1.0).correlated.mean()))
+        likely.append(np.sqrt(cell_errors(tilted, 1.0, coherent=(tilt,)).correlated.mean()))
+    np.testing.assert_allclose(np.mean(likely), np.mean(known), rtol=0.1, atol=0)
