@@ -254,7 +254,7 @@ class _Problem:
             if on_step is not None:
                 on_step(next(done, total), total, "adjustment to earlier flights")
 
-        rough = replace(settings.adjustment, rounds=2, min_views=2)
+        rough = replace(settings.adjustment, rounds=2, min_views=2, heeds_contradiction=False)
         both = Observations.join([own, shared])
         first = adjust(self.given, both, self.information, rough, start=self.start, on_round=on_round)
         is_shared = first.origin >= own.n_points

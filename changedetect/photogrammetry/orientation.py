@@ -247,9 +247,9 @@ def orient_flight(
     InputDataError
         Observations and poses contradict each other.
     """
-    rough = AdjustmentSettings(rounds=2)
+    rough = AdjustmentSettings(rounds=2, heeds_contradiction=False)
     if start is not None:
-        rough = replace(settings.adjustment, rounds=2, boresight_std=0.0, min_views=2)
+        rough = replace(settings.adjustment, rounds=2, boresight_std=0.0, min_views=2, heeds_contradiction=False)
     first = adjust(block, Observations.join([matching.tracks, matching.ties]), information, rough, start=start)
     is_track = first.origin < matching.tracks.n_points
     kept, _ = first.observations.keep(is_track[first.observations.point])
@@ -330,7 +330,7 @@ def orient_together(
     require_shared(given, shared, settings.joint, names)
     own = Observations.join([result.observations for result in oriented], [int(k) for k in offsets[:-1]])
     information = block_diag(*informations)
-    rough = replace(settings.adjustment, rounds=2, min_views=2)
+    rough = replace(settings.adjustment, rounds=2, min_views=2, heeds_contradiction=False)
     report = _counter(on_step, 2 + settings.adjustment.rounds, "adjustment together")
     first = adjust(given, Observations.join([own, shared]), information, rough, start=start, on_round=report)
     is_shared = first.origin >= own.n_points

@@ -148,6 +148,7 @@ def orient_roughly(
         weighted = replace(observations, sigma=np.full(len(observations), sigma))
         lens = adjustment.lens if k else ()
         stage = replace(adjustment, lens=lens, boresight_std=0.0, rounds=3, min_views=2)
+        stage = replace(stage, heeds_contradiction=False)
         solved = adjust(given, weighted, information, stage, start=start)
         start = solved.block
     logger.info(

@@ -140,7 +140,7 @@ def compare(points, reference_path, bending, reference_bending):
 
 
 def as_the_reference(folder, work, workers):
-    """Points of the same photos adjusted with hardly any priors, shape (n, 4); covariances of bending, theirs and ours."""
+    """Points of the same photos adjusted with hardly any priors, shape (n, 4); covariance of their bending and ours."""
     source = read_flight_source(folder)
     run = FlightRun(source, FlightStore(work), OrientationSettings(workers=workers), source.poses.origin)
     n = len(source.poses)

@@ -14,6 +14,7 @@ from changedetect.navigation.frame import LocalFrame
 from changedetect.photogrammetry.anchored import Anchor, FinishedFlight, orient_to_anchors
 from changedetect.photogrammetry.common_error import common_error, error_factor, point_modes
 from changedetect.photogrammetry.joint import JointSettings, SharedPoints, unchanged
+from changedetect.pipeline.flight_store import load_finished, save_finished
 
 
 def anchor_of(case, name="first"):
@@ -118,3 +119,27 @@ def test_ground_that_moved_is_kept_out_of_the_points_that_bind(change, radius):
     assert keep[has_moved].mean() < 0.05
     away = np.hypot(place[:, 0] - 10, place[:, 1] + 5) > radius + 7
     assert keep[away].mean() > 0.97
+
+
+def test_a_flight_written_with_five_lens_parameters_is_read_with_the_others_exact(anchored, tmp_path):
+    flight = anchored.finished
+    save_finished(tmp_path / "now.npz", flight)
+    with np.load(tmp_path / "now.npz") as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    n = 6 * len(flight.adjustment.block)
+    arrays["camera_covariance"] = arrays["camera_covariance"][: n + 5, : n + 5]
+    for name in ("lens_correction", "lens_std"):
+        arrays[name] = arrays[name][:, :5]
+    for k, other in enumerate(flight.cross):
+        arrays[f"cross_{k}"] = flight.cross[other][: n + 5, : flight.cross[other].shape[1] - 4]
+    del arrays["lens_slope"]
+    np.savez(tmp_path / "before.npz", **arrays)
+    read = load_finished(tmp_path / "before.npz")
+    expected = flight.adjustment.camera_covariance.copy()
+    expected[n + 5 :], expected[:, n + 5 :] = 0.0, 0.0
+    assert_allclose(read.adjustment.camera_covariance, expected, rtol=0, atol=0)
+    assert read.adjustment.lens_std.shape == (1, 9)
+    assert not read.adjustment.lens_slope.any()
+    assert [c.shape for c in read.cross.values()] == [c.shape for c in flight.cross.values()]
+    again = read.in_frame(LocalFrame(flight.origin.latitude, flight.origin.longitude, flight.origin.height + 1.0))
+    assert_allclose(np.trace(again.adjustment.camera_covariance), np.trace(expected), rtol=1e-9, atol=0)
