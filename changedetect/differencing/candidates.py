@@ -37,8 +37,9 @@ _FALSE_DISCS = 0.15
 _LEAST_LIMIT = 3.0
 #: Discs are taken where their score is at least this part of the largest one around, and again after these are out.
 _PEAK = 0.6
-#: Rounds of looking for discs and growing regions from them.
+#: Rounds of looking for discs and growing regions from them, at most; they end when less than a part of the map is new.
 _ROUNDS = 4
+_SETTLED = 5e-4
 #: A map holds this many blocks along its shorter side, at least, when discs are looked for.
 _LEAST_BLOCKS = 8
 #: A region goes as far as its smoothed score is beyond this.
@@ -104,7 +105,7 @@ def find_candidates(
         ]
         before = out
         out = out | seeds | regions[0] | regions[1]
-        if np.array_equal(before, out):
+        if np.count_nonzero(before != out) <= _SETTLED * out.size:
             break
     data = finest.without(regions[0] | regions[1])
     margin = max(1, math.ceil(_MARGIN * reach))

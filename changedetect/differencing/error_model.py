@@ -39,6 +39,8 @@ _N_MEANS = 500_000
 _ROUNDS = 4
 #: Rounds more, in which changed ground is told by what the ground around says.
 _LATER_ROUNDS = 2
+#: Rounds end when less than this part of the ground comes or goes.
+_SETTLED = 2e-3
 #: Part of the known ground that must be left.
 _LEAST_SHARE = 0.3
 #: Tails assumed while change has not been looked for.
@@ -185,7 +187,7 @@ def estimate_errors(
                 resolution, local_range,
             )  # fmt: skip
             left = known & ~changed
-            settled = k > 0 and np.array_equal(left, ground)
+            settled = k > 0 and _is_settled(left, ground)
             if settled or np.count_nonzero(left) < _LEAST_CELLS:
                 break
             ground = left
@@ -222,7 +224,7 @@ def _estimate_again(
         given = np.nan_to_num(block_means(changed.astype(np.float64), known, finest.factor)[0]) > 0.5
         found = find_candidates(finest, chosen[0], correlations, given)
         left = known & ~expand(found, finest.factor, known.shape)
-        settled = np.array_equal(left, ground)
+        settled = _is_settled(left, ground)
         if settled or np.count_nonzero(left) < max(_LEAST_CELLS, _LEAST_SHARE * np.count_nonzero(known)):
             break
         ground = left
@@ -233,6 +235,11 @@ def _estimate_again(
             break
         model = later
     return model, ground
+
+
+def _is_settled(left: BoolArray, before: BoolArray) -> bool:
+    """Whether ground is so nearly what it was that errors estimated on it will be too."""
+    return bool(np.count_nonzero(left != before) <= _SETTLED * np.count_nonzero(before))
 
 
 def _estimate_round(

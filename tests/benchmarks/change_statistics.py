@@ -326,7 +326,7 @@ def cost(predict):
         difference[300 + 800 * (k % 2) : 500 + 800 * (k % 2), 200 + 600 * (k // 2) : 400 + 600 * (k // 2)] += height
     found = evidence(difference, 0.01)
     # compiled code is loaded once a process
-    cell_errors(evidence(quiet(2, (300, 300)) + smooth_field(rng, (300, 300), 0.05, 30.0), 0.01), 1.0, predict=predict)
+    cell_errors(evidence(difference[200:600, 100:500], 0.01), 1.0, predict=predict)
     before, start, wall = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time(), time.time()
     errors = cell_errors(found, 1.0, predict=predict)
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
