@@ -28,12 +28,12 @@ from changedetect.photogrammetry.anchored import Anchor, AnchoredFlight, Finishe
 from changedetect.photogrammetry.common_error import CommonError, common_error, error_factor, point_modes
 from changedetect.photogrammetry.orientation import OrientationSettings, Step
 from changedetect.pipeline.flight_inputs import check_files, flight_files, listing_sha256
+from changedetect.pipeline.flight_points import FlightPart, write_flight
 from changedetect.pipeline.flight_run import FlightRun, default_workers, read_flight_source
 from changedetect.pipeline.flight_store import FlightStore, load_finished, save_finished
 from changedetect.pipeline.manifest import utc_now
 from changedetect.pipeline.photo_agreement import check_agreement
 from changedetect.pipeline.photo_clock import with_camera_in_time
-from changedetect.pipeline.reconstruct import FlightPart, ReconstructOptions, write_flight
 from changedetect.storage import atomic_directory, sha256_of_file, write_json
 from changedetect.typing import FloatArray, JSONObject
 
@@ -128,9 +128,10 @@ def reconstruct_epoch(
     check_agreement(run, part.adjustment, part.images, part.points)
     factor = error_factor(finished.adjustment.camera_covariance)
     error = common_error(point_modes(finished.adjustment, everything, factor))
-    options = ReconstructOptions(dense=config.flights.dense)
     with atomic_directory(programme.flight_directory(epoch.epoch_id) / POINTS_FOLDER) as folder:
-        points, described = write_flight(run, folder / POINTS_FILE, part, config.crs, options, has_bend_apart=True)
+        points, described = write_flight(
+            run, folder / POINTS_FILE, part, config.crs, is_dense=config.flights.dense, has_bend_apart=True
+        )
         described["file"] = POINTS_FILE
         save_finished(folder / _ORIENTATION_FILE, finished)
         records = _anchor_records(programme, anchor_ids, anchored, run.origin)
