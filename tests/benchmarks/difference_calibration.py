@@ -21,14 +21,16 @@ from changedetect.synthetic import benchmark_points
 MARGIN = {2.5: 4.2, 9.0: 2.1, 100.0: 1.6}  # m, more than the radius of a field of the difference
 
 
+def epochs(density: float, seed: int):
+    """Scene, and models of the two epochs."""
+    surveys = benchmark_points(seed, density=density)
+    models = [LWPRSurface(resolution=0.25).fit((s.cloud.easting, s.cloud.northing), s.cloud.elevation) for s in surveys]
+    return surveys[0].scene, models
+
+
 def draw(density: float, seed: int):
     """Share flagged and z where nothing changed; (height, power, mean change) of every patch."""
-    earlier, later = benchmark_points(seed, density=density)
-    models = [
-        LWPRSurface(resolution=0.25).fit((s.cloud.easting, s.cloud.northing), s.cloud.elevation)
-        for s in (earlier, later)
-    ]
-    scene = earlier.scene
+    scene, models = epochs(density, seed)
     grid = Grid.from_region(scene.region, 0.5, scene.crs)
     maps = difference_models(*models, grid, DifferencingConfig())
     easting, northing = grid.coordinates()
@@ -48,12 +50,7 @@ def draw(density: float, seed: int):
 
 def edge_width(density: float, seed: int) -> float:
     """Distance, m, over which the mean profile across the edges of the 0.5 m patch rises from 10 to 90 % of it."""
-    earlier, later = benchmark_points(seed, density=density)
-    models = [
-        LWPRSurface(resolution=0.25).fit((s.cloud.easting, s.cloud.northing), s.cloud.elevation)
-        for s in (earlier, later)
-    ]
-    scene = earlier.scene
+    scene, models = epochs(density, seed)
     grid = Grid.from_region(scene.region, 0.125, scene.crs)
     easting, northing = grid.coordinates()
     patch = np.argwhere(scene.change(easting, northing).reshape(grid.shape) > 0.4)
