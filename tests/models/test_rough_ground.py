@@ -78,13 +78,13 @@ def test_where_there_is_noise_only_the_process_has_no_variance():
     assert np.median(variance) < 0.1 * 0.1**2
 
 
-def test_the_variance_is_known_from_the_pairs_of_neighbours_around():
+def test_the_variance_is_known_from_the_cells_around():
     x, y, z = survey(rough, 6000, 0.05, 7)
     cells = LWPRSurface().fit((x, y), z).own_cells()
     lattice = Lattice.covering(cells.region, 1.0, 0.8)
     _, freedom = process_variance(cells, lattice, 1.0, 4.0)
     extent = float(np.ptp(x) * np.ptp(y))
-    expected = 2.0 * len(cells) / extent * 4.0 * np.pi * (2.6 * lattice.spacing) ** 2
+    expected = len(cells) / extent * 4.0 * np.pi * (2.6 * lattice.spacing) ** 2
     middle = freedom[lattice.n_rows // 2, lattice.n_columns // 2]
     assert_allclose(middle, expected, rtol=0.25, atol=0.0)
     assert freedom[0, 0] < 0.5 * middle
