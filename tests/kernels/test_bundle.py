@@ -14,7 +14,7 @@ from changedetect.kernels.bundle import (
     reduced_system,
 )
 from changedetect.kernels.matching import match_near
-from changedetect.kernels.projection import project, project_many, projection_jacobian
+from changedetect.kernels.projection import N_CALIBRATION, project, project_many, projection_jacobian
 from changedetect.kernels.triangulation import triangulate
 
 LENS = np.array([500.0, 505.0, 160.0, 120.0, -0.1, 0.03, 0.001, -0.0008, 0.004])
@@ -39,12 +39,20 @@ def scene(seed=0, n_images=4, n_points=6, noise=0.0):
     return points, rotation, position, intrinsics, lens, start, image, pixel
 
 
+def corrected(intrinsics, lens):
+    """Lens moved by unknowns of the adjustment: log focal length, cx, cy, k1, k2, k3, p1, p2, log fx / fy."""
+    result = intrinsics.copy()
+    result[:2] *= np.exp(lens[0] + np.array([0.5, -0.5]) * lens[8])
+    result[2:6] += lens[1:5]
+    result[6:8] += lens[6:8]
+    result[8] += lens[5]
+    return result
+
+
 def moved(arguments, pose, lens):
     """Arguments with cameras moved by unknowns of the adjustment."""
     points, rotation, position, intrinsics, *rest = arguments
-    intrinsics = intrinsics.copy()
-    intrinsics[:, :2] *= np.exp(lens[:, :1])
-    intrinsics[:, 2:6] += lens[:, 1:]
+    intrinsics = np.array([corrected(*both) for both in zip(intrinsics, lens, strict=True)])
     turned = Rotation.from_rotvec(pose[:, 3:]).as_matrix() @ rotation
     return points, turned, position + pose[:, :3], intrinsics, *rest
 
@@ -56,33 +64,30 @@ def residual_jacobian(arguments):
     point = np.repeat(np.arange(len(points)), np.diff(start))
 
     def pixels(x):
-        pose, calibration = x[: 6 * n].reshape(n, 6), x[6 * n : 6 * n + 5 * g].reshape(g, 5)
-        places = points + x[6 * n + 5 * g :].reshape(-1, 3)
+        pose, calibration = x[: 6 * n].reshape(n, 6), x[6 * n : 6 * n + N_CALIBRATION * g].reshape(g, N_CALIBRATION)
+        places = points + x[6 * n + N_CALIBRATION * g :].reshape(-1, 3)
         _, r, p, k, *_ = moved(arguments, pose, calibration)
         return project_many(places, r, p, k, point, image, lens)[:, :2].ravel()
 
-    size = 6 * n + 5 * g + 3 * len(points)
+    size = 6 * n + N_CALIBRATION * g + 3 * len(points)
     columns = [(pixels(e) - pixels(-e)) / 2e-6 for e in np.eye(size) * 1e-6]
     return np.array(columns).T
 
 
 def test_derivatives_of_the_projection_match_finite_differences():
     points, rotation, position, *_ = scene()
-    by_point, by_pose, by_lens = np.empty((2, 3)), np.empty((2, 6)), np.empty((2, 5))
+    by_point, by_pose, by_lens = np.empty((2, 3)), np.empty((2, 6)), np.empty((2, N_CALIBRATION))
     column, row, depth = projection_jacobian(points[0], rotation[0], position[0], LENS, by_point, by_pose, by_lens)
     assert_allclose((column, row, depth), project(points[0], rotation[0], position[0], LENS), rtol=1e-14, atol=0)
 
     def at(pose, lens, shift):
-        k = LENS.copy()
-        k[:2] *= np.exp(lens[0])
-        k[2:6] += lens[1:]
         turned = Rotation.from_rotvec(pose[3:]).as_matrix() @ rotation[0]
-        return np.array(project(points[0] + shift, turned, position[0] + pose[:3], k)[:2])
+        return np.array(project(points[0] + shift, turned, position[0] + pose[:3], corrected(LENS, lens))[:2])
 
     step = 1e-6
     for analytic, which in ((by_pose, 0), (by_lens, 1), (by_point, 2)):
         for k in range(analytic.shape[1]):
-            forth = [np.zeros(6), np.zeros(5), np.zeros(3)]
+            forth = [np.zeros(6), np.zeros(N_CALIBRATION), np.zeros(3)]
             forth[which][k] = step
             back = [-v for v in forth]
             assert_allclose(analytic[:, k], (at(*forth) - at(*back)) / (2 * step), rtol=1e-5, atol=1e-4)
@@ -114,9 +119,11 @@ def test_point_covariances_are_blocks_of_the_inverse_of_the_whole_system():
     arguments = scene()
     weight = np.full(len(arguments[6]), 4.0)
     jacobian = residual_jacobian(arguments)
-    n = 6 * 4 + 5 * 2
+    n = 6 * 4 + N_CALIBRATION * 2
     prior = np.zeros(jacobian.shape[1])
-    prior[:n] = np.concatenate([np.tile([1.0] * 3 + [1e4] * 3, 4), np.tile([1e4, 1e-2, 1e-2, 1e4, 1e4], 2)])
+    prior[:n] = np.concatenate(
+        [np.tile([1.0] * 3 + [1e4] * 3, 4), np.tile([1e4, 1e-2, 1e-2, 1e4, 1e4, 1e4, 1e6, 1e6, 1e6], 2)]
+    )
     covariance = np.linalg.inv(4.0 * jacobian.T @ jacobian + np.diag(prior))
     own, shared = point_covariances(*arguments, weight, covariance[:n, :n])
     for p in range(len(own)):
@@ -127,10 +134,11 @@ def test_point_covariances_are_blocks_of_the_inverse_of_the_whole_system():
 def test_modes_are_what_a_new_triangulation_gives():
     arguments = scene()
     weight = np.ones(len(arguments[6]))
-    mode = np.random.default_rng(5).normal(0, 1e-5, 34)
+    n = 6 * 4 + N_CALIBRATION * 2
+    mode = np.random.default_rng(5).normal(0, 1e-5, n)
     heights = coordinate_modes(*arguments, weight, mode[:, None], 2)[:, 0]
-    shifted = moved(arguments, mode[:24].reshape(4, 6), mode[24:].reshape(2, 5))
-    steps = point_steps(*shifted, weight, 0.0, np.zeros(34))
+    shifted = moved(arguments, mode[:24].reshape(4, 6), mode[24:].reshape(2, N_CALIBRATION))
+    steps = point_steps(*shifted, weight, 0.0, np.zeros(n))
     assert_allclose(heights, steps[:, 2], rtol=1e-3, atol=1e-7)
     east = coordinate_modes(*arguments, weight, mode[:, None], 0)[:, 0]
     assert_allclose(east, steps[:, 0], rtol=1e-3, atol=1e-7)
