@@ -26,9 +26,8 @@ def block_sums(values: FloatArray, factor: int) -> FloatArray:
     -------
     sums : array, shape (ceil(n_rows / factor), ceil(n_cols / factor))
     """
-    padded = (
-        np.pad(values, [(0, -n % factor) for n in values.shape]) if any(n % factor for n in values.shape) else values
-    )
+    lacking = [(0, -n % factor) for n in values.shape]
+    padded = np.pad(values, lacking) if np.any(lacking) else values
     n_rows, n_cols = padded.shape
     # rows first: whole rows are added at a time
     rows = padded.reshape(n_rows // factor, factor, n_cols).sum(axis=1)

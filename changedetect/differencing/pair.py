@@ -128,7 +128,7 @@ def cell_errors(
     errors : CellErrors
     """
     known = evidence.known
-    shape = evidence.difference.shape
+    shape = (known.shape[0], known.shape[1])
     difference = np.where(known, evidence.difference, np.nan)
     variance = np.where(known, evidence.variance, 0.0)
     smoothing = evidence.correlation_length / (math.sqrt(FIELD_AREA) * resolution)
@@ -141,24 +141,28 @@ def cell_errors(
     model, ground = estimate_errors(difference, variance, covariates, resolution, local_range, stable)
     shared = np.zeros(shape)
     for term in coherent:
-        shared += term.variance((shape[0], shape[1]))
+        shared += term.variance(shape)
     unchanged = ground & known
     if model.is_correlated and np.mean(shared[unchanged]) > _COHERENT_SHARE * np.mean(difference[unchanged] ** 2):
         # Else the coherent errors of this difference would count twice, once among those that its scatter shows
-        columns = [column for term in coherent for column in term.independent_errors((shape[0], shape[1]))]
-        less = difference - likely_errors(difference, columns, unchanged, model.n_independent)
+        likely = likely_errors(difference, _independent_errors(coherent, shape), unchanged, model.n_independent)
+        less = difference - likely
         model, ground = estimate_errors(less, variance, covariates, resolution, local_range, stable)
-    correlated = model.correlated_variance(covariates, (shape[0], shape[1]))
+    correlated = model.correlated_variance(covariates, shape)
     errors = CellErrors(model, correlated, shared, tuple(coherent), ground)
     if not predict or not model.is_correlated:
         return errors
     prediction = predict_errors(
         difference, (variance, correlated), model, ground, resolution,
-        [column for term in coherent for column in term.independent_errors((shape[0], shape[1]))],
+        _independent_errors(coherent, shape),
         is_given=stable is not None,
         noise=math.exp(float(np.median(covariates["noise"][known]))),
     )  # fmt: skip
     return replace(errors, prediction=prediction)
+
+
+def _independent_errors(coherent: Sequence[CoherentTerm], shape: tuple[int, int]) -> list[FloatArray]:
+    return [error for term in coherent for error in term.independent_errors(shape)]
 
 
 def _adaptive_evidence(earlier: LWPRSurface, later: LWPRSurface, grid: Grid) -> Evidence:
